@@ -1,0 +1,1 @@
+"""The camera: model, undistortion, calibration and its uncertainty."""

@@ -1,0 +1,1 @@
+"""Measured points and the surfaces through them."""

@@ -1,0 +1,1 @@
+"""Printed targets: what is printed, finding it, naming it, and measuring each target's pose."""

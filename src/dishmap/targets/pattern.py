@@ -1,0 +1,253 @@
+"""What is printed and where: circles in target kinds, targets on a nominal surface.
+
+A target is a small set of circles in its own plane; disc, ring, concentric rings, WhyCon-like ring and the paper's
+multi-circular group are all instances of `TargetKind`. Circles are disjoint or nested, and nested ones alternate between
+dark and light inside, so that the ink's coverage is the signed sum of discs.
+
+Pattern (dish) frame: origin at the vertex of the nominal surface, z along the boresight towards the focus and the camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dishmap.errors import PatternError
+
+Array = NDArray[np.float64]
+
+SURFACE_KINDS = ("plane", "paraboloid")
+# Axes in a file may carry rounding; 1e-6 is what 7 digits leave.
+AXIS_TOLERANCE = 1e-5
+# Larger than any dish a camera looks at; a pattern in metres or micrometres falls outside.
+SMALLEST_RADIUS_MM, LARGEST_MM = 0.01, 1e5
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The nominal surface: `plane` (z = 0) or `paraboloid` (z = rho^2 / 4f) with its rim's diameter."""
+
+    kind: str = "plane"
+    diameter_mm: float | None = None
+    focal_length_mm: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in SURFACE_KINDS:
+            raise PatternError(f"unknown surface {self.kind!r}; use one of {', '.join(SURFACE_KINDS)}")
+        if self.kind == "paraboloid" and self.focal_length_mm is None:
+            raise PatternError("a paraboloid needs focal_length_mm")
+        for name in ("diameter_mm", "focal_length_mm"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < LARGEST_MM:
+                raise PatternError(f"the surface's {name} must lie between 0 and {LARGEST_MM:g} mm, not {value}")
+
+    def height_mm(self, xy_mm: Array) -> Array:
+        """Height z of the nominal surface at (..., 2)."""
+        xy = np.asarray(xy_mm, dtype=float)
+        if self.focal_length_mm is None or self.kind == "plane":
+            return np.zeros(xy.shape[:-1])
+        return np.asarray((xy**2).sum(axis=-1) / (4 * self.focal_length_mm))
+
+    def normal(self, xy_mm: Array) -> Array:
+        """Unit normal (..., 3) towards the focus at (..., 2)."""
+        xy = np.asarray(xy_mm, dtype=float)
+        curvature = 0.0 if self.focal_length_mm is None or self.kind == "plane" else 0.5 / self.focal_length_mm
+        n = np.concatenate([-xy * curvature, np.ones((*xy.shape[:-1], 1))], axis=-1)
+        return np.asarray(n / np.linalg.norm(n, axis=-1, keepdims=True))
+
+    def curvature_per_mm(self, xy_mm: Array, x_axis: Array, y_axis: Array) -> Array:
+        """Second fundamental form (..., 2, 2) towards the normal, in tangent axes (..., 3) at (..., 2).
+
+        A printed point at (x, y) of a target stands off its tangent plane by half of [x y] K [x y]^T along the normal.
+        """
+        axes = np.stack([x_axis, y_axis], axis=-2)[..., :2]
+        if self.focal_length_mm is None or self.kind == "plane":
+            return np.zeros((*axes.shape[:-1], 2))
+        nz = self.normal(xy_mm)[..., 2]
+        return np.asarray(nz[..., None, None] / (2 * self.focal_length_mm) * (axes @ np.swapaxes(axes, -1, -2)))
+
+
+@dataclass(frozen=True)
+class TargetKind:
+    """Circles of one kind of target, in the target's plane.
+
+    center_mm (C, 2); radius_mm (C,); dark (C,) is true where the circle's inside is ink, false where it is ground.
+    """
+
+    center_mm: Array
+    radius_mm: Array
+    dark: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "center_mm", np.asarray(self.center_mm, dtype=float).reshape(-1, 2))
+        object.__setattr__(self, "radius_mm", np.asarray(self.radius_mm, dtype=float).reshape(-1))
+        object.__setattr__(self, "dark", np.asarray(self.dark, dtype=bool).reshape(-1))
+        if not len(self.radius_mm) or not (len(self.center_mm) == len(self.radius_mm) == len(self.dark)):
+            raise PatternError("a target kind needs at least one circle, each with center_mm, radius_mm and inside")
+        if not (np.isfinite(self.center_mm).all() and (np.abs(self.center_mm) < LARGEST_MM).all()):
+            raise PatternError("a circle's center_mm must be finite numbers in mm")
+        good = (self.radius_mm >= SMALLEST_RADIUS_MM) & (self.radius_mm < LARGEST_MM)
+        if not good.all():
+            raise PatternError(f"a circle's radius_mm must lie between {SMALLEST_RADIUS_MM} and {LARGEST_MM:g}, not {self.radius_mm[~good][0]}")
+        self._check_nesting()
+
+    def _check_nesting(self) -> None:
+        """Raise PatternError unless circles are disjoint or nested, alternating in colour."""
+        distance = np.linalg.norm(self.center_mm[:, None] - self.center_mm[None], axis=-1)
+        for i in range(len(self.radius_mm)):
+            for j in range(i):
+                a, b = self.radius_mm[i], self.radius_mm[j]
+                if abs(a - b) < distance[i, j] < a + b or (distance[i, j] == 0 and a == b):
+                    raise PatternError(f"circles {j} and {i} of a target kind cross; they must be disjoint or nested")
+        for i, parent in enumerate(self.parent):
+            if self.dark[i] == (self.dark[parent] if parent >= 0 else False):
+                raise PatternError(f"circle {i} of a target kind has the colour of what surrounds it; nested circles alternate, outermost are dark")
+
+    @cached_property
+    def parent(self) -> NDArray[np.int64]:
+        """Index of the smallest circle around each circle, -1 for the outermost (C,)."""
+        parent = np.full(len(self.radius_mm), -1)
+        for i, (center, radius) in enumerate(zip(self.center_mm, self.radius_mm, strict=True)):
+            around = (np.linalg.norm(self.center_mm - center, axis=1) + radius <= self.radius_mm + 1e-9) & (self.radius_mm > radius)
+            if around.any():
+                parent[i] = np.flatnonzero(around)[np.argmin(self.radius_mm[around])]
+        return parent
+
+    @cached_property
+    def extent_mm(self) -> float:
+        """Radius about the target's origin that holds all of its ink."""
+        return float((np.linalg.norm(self.center_mm, axis=1) + self.radius_mm).max())
+
+    @property
+    def turns_freely(self) -> bool:
+        """True when all circles share the origin, so that a turn about the normal changes nothing."""
+        return bool(np.abs(self.center_mm).max() < 1e-9)
+
+    @property
+    def has_light_edges(self) -> bool:
+        """True when it has edges of both senses, so that ink spread and size can be told apart."""
+        return bool((~self.dark).any())
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """Targets on a nominal surface, in the dish frame.
+
+    ids (N,); kind_index (N,) into `kind_names`; center_mm, x_axis, normal (N, 3); `kinds[kind_names[i]]` is a TargetKind.
+    Raises PatternError when arrays disagree, ids repeat, axes are not orthonormal or targets overlap.
+    """
+
+    name: str
+    surface: Surface
+    kinds: dict[str, TargetKind]
+    ids: NDArray[np.int64]
+    kind_names: tuple[str, ...]
+    center_mm: Array
+    x_axis: Array
+    normal: Array
+
+    def __post_init__(self) -> None:
+        for name in ("center_mm", "x_axis", "normal"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float).reshape(-1, 3))
+        object.__setattr__(self, "ids", np.asarray(self.ids, dtype=np.int64).reshape(-1))
+        object.__setattr__(self, "kind_names", tuple(self.kind_names))
+        self._check()
+
+    def _check(self) -> None:
+        n = len(self.ids)
+        if not n:
+            raise PatternError("a pattern needs at least one target")
+        if not (len(self.kind_names) == len(self.center_mm) == len(self.x_axis) == len(self.normal) == n):
+            raise PatternError("each target needs id, kind, center_mm, x_axis and normal")
+        unknown = sorted(set(self.kind_names) - set(self.kinds))
+        if unknown:
+            raise PatternError(f"target kind {unknown[0]!r} is used but not defined; defined are {', '.join(sorted(self.kinds))}")
+        values, counts = np.unique(self.ids, return_counts=True)
+        if (counts > 1).any():
+            raise PatternError(f"target id {values[counts > 1][0]} is given twice; ids must differ")
+        if not (np.isfinite(self.center_mm).all() and (np.abs(self.center_mm) < LARGEST_MM).all()):
+            raise PatternError(f"a target's center_mm must be finite and within {LARGEST_MM:g} mm")
+        lengths = np.linalg.norm(np.stack([self.x_axis, self.normal]), axis=-1)
+        dot = (self.x_axis * self.normal).sum(axis=1)
+        if not (np.isfinite(lengths).all() and np.abs(lengths - 1).max() < AXIS_TOLERANCE and np.abs(dot).max() < AXIS_TOLERANCE):
+            bad = int(np.argmax(np.nan_to_num(np.abs(lengths - 1).max(axis=0) + np.abs(dot), nan=np.inf)))
+            raise PatternError(f"x_axis and normal of target {self.ids[bad]} must be unit vectors at right angles")
+        self._check_overlap()
+
+    def _check_overlap(self) -> None:
+        from scipy.spatial import cKDTree
+
+        extent = np.array([self.kinds[k].extent_mm for k in self.kind_names])
+        for i, j in cKDTree(self.center_mm).query_pairs(2 * extent.max()):
+            if np.linalg.norm(self.center_mm[i] - self.center_mm[j]) < 1e-6 + 0.5 * (extent[i] + extent[j]):
+                raise PatternError(f"targets {self.ids[i]} and {self.ids[j]} lie on top of each other")
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @cached_property
+    def axes(self) -> Array:
+        """Rotation dish_from_target of each target (N, 3, 3): columns x_axis, y_axis, normal."""
+        return np.stack([self.x_axis, np.cross(self.normal, self.x_axis), self.normal], axis=-1)
+
+    @cached_property
+    def curvature_per_mm(self) -> Array:
+        """Second fundamental form of the nominal surface in each target's axes (N, 2, 2)."""
+        axes = self.axes
+        return self.surface.curvature_per_mm(self.center_mm[:, :2], axes[..., 0], axes[..., 1])
+
+    def kind_of(self, index: int) -> TargetKind:
+        """The TargetKind of target number `index` (not its id)."""
+        return self.kinds[self.kind_names[index]]
+
+    @cached_property
+    def marks(self) -> Marks:
+        """Every outermost circle with what is nested in it, over all targets: what a detector can see one by one."""
+        return _marks(self)
+
+
+@dataclass(frozen=True)
+class Marks:
+    """Outermost circles of all targets, with their nested circles: the things a detector finds.
+
+    target (M,): index of the target each belongs to; center_mm (M, 3) in the dish frame, on the surface; normal (M, 3);
+    radius_mm (M,); type_index (M,): equal for marks that look alike; type_ratios: for each type, the radii of the circles
+    nested in it divided by its own, largest first.
+    """
+
+    target: NDArray[np.int64]
+    center_mm: Array
+    normal: Array
+    radius_mm: Array
+    type_index: NDArray[np.int64]
+    type_ratios: tuple[tuple[float, ...], ...]
+
+
+def _marks(pattern: Pattern) -> Marks:
+    rows: list[tuple[int, Array, float, tuple[float, ...]]] = []
+    for index, kind_name in enumerate(pattern.kind_names):
+        kind = pattern.kinds[kind_name]
+        for outer in np.flatnonzero(kind.parent < 0):
+            inside = np.linalg.norm(kind.center_mm - kind.center_mm[outer], axis=1) < kind.radius_mm[outer]
+            inside[outer] = False
+            ratios = tuple(sorted((round(float(r), 6) for r in kind.radius_mm[inside] / kind.radius_mm[outer]), reverse=True))
+            rows.append((index, kind.center_mm[outer], float(kind.radius_mm[outer]), ratios))
+    target = np.array([row[0] for row in rows])
+    local = np.array([row[1] for row in rows])
+    # two marks are of one type only if their sizes agree too
+    keys = [(round(row[2], 6), row[3]) for row in rows]
+    types = sorted(set(keys))
+    sag = 0.5 * np.einsum("mi,mij,mj->m", local, pattern.curvature_per_mm[target], local)
+    offset = np.concatenate([local, sag[:, None]], axis=1)
+    center = pattern.center_mm[target] + np.einsum("mij,mj->mi", pattern.axes[target], offset)
+    return Marks(
+        target=target,
+        center_mm=center,
+        normal=pattern.normal[target],
+        radius_mm=np.array([row[2] for row in rows]),
+        type_index=np.array([types.index(key) for key in keys]),
+        type_ratios=tuple(ratios for _, ratios in types),
+    )
