@@ -117,6 +117,23 @@ class TargetKind:
         return parent
 
     @cached_property
+    def outermost(self) -> NDArray[np.int64]:
+        """Index of the outermost circle around each circle, its own where nothing is around it (C,)."""
+        outer = np.arange(len(self.radius_mm))
+        for _ in outer:
+            outer = np.where(self.parent[outer] >= 0, self.parent[outer], outer)
+        return outer
+
+    @cached_property
+    def gap_mm(self) -> float:
+        """Smallest width of ground between two outermost circles; infinite for a single one."""
+        top = np.flatnonzero(self.parent < 0)
+        gaps = [
+            np.linalg.norm(self.center_mm[i] - self.center_mm[j]) - self.radius_mm[i] - self.radius_mm[j] for i in top for j in top if i < j
+        ]
+        return float(min(gaps, default=np.inf))
+
+    @cached_property
     def extent_mm(self) -> float:
         """Radius about the target's origin that holds all of its ink."""
         return float((np.linalg.norm(self.center_mm, axis=1) + self.radius_mm).max())
@@ -213,12 +230,13 @@ class Pattern:
 class Marks:
     """Outermost circles of all targets, with their nested circles: the things a detector finds.
 
-    target (M,): index of the target each belongs to; center_mm (M, 3) in the dish frame, on the surface; normal (M, 3);
+    target (M,): index of the target each belongs to; circle (M,): which circle of its kind; center_mm (M, 3) in the dish frame, on the surface; normal (M, 3);
     radius_mm (M,); type_index (M,): equal for marks that look alike; type_ratios: for each type, the radii of the circles
     nested in it divided by its own, largest first.
     """
 
     target: NDArray[np.int64]
+    circle: NDArray[np.int64]
     center_mm: Array
     normal: Array
     radius_mm: Array
@@ -227,27 +245,27 @@ class Marks:
 
 
 def _marks(pattern: Pattern) -> Marks:
-    rows: list[tuple[int, Array, float, tuple[float, ...]]] = []
+    rows: list[tuple[int, int, Array, float, tuple[float, ...]]] = []
     for index, kind_name in enumerate(pattern.kind_names):
         kind = pattern.kinds[kind_name]
         for outer in np.flatnonzero(kind.parent < 0):
-            inside = np.linalg.norm(kind.center_mm - kind.center_mm[outer], axis=1) < kind.radius_mm[outer]
-            inside[outer] = False
+            inside = (kind.outermost == outer) & (kind.parent >= 0)
             ratios = tuple(sorted((round(float(r), 6) for r in kind.radius_mm[inside] / kind.radius_mm[outer]), reverse=True))
-            rows.append((index, kind.center_mm[outer], float(kind.radius_mm[outer]), ratios))
+            rows.append((index, int(outer), kind.center_mm[outer], float(kind.radius_mm[outer]), ratios))
     target = np.array([row[0] for row in rows])
-    local = np.array([row[1] for row in rows])
+    local = np.array([row[2] for row in rows])
     # two marks are of one type only if their sizes agree too
-    keys = [(round(row[2], 6), row[3]) for row in rows]
+    keys = [(round(row[3], 6), row[4]) for row in rows]
     types = sorted(set(keys))
     sag = 0.5 * np.einsum("mi,mij,mj->m", local, pattern.curvature_per_mm[target], local)
     offset = np.concatenate([local, sag[:, None]], axis=1)
     center = pattern.center_mm[target] + np.einsum("mij,mj->mi", pattern.axes[target], offset)
     return Marks(
         target=target,
+        circle=np.array([row[1] for row in rows]),
         center_mm=center,
         normal=pattern.normal[target],
-        radius_mm=np.array([row[2] for row in rows]),
+        radius_mm=np.array([row[3] for row in rows]),
         type_index=np.array([types.index(key) for key in keys]),
         type_ratios=tuple(ratios for _, ratios in types),
     )

@@ -1,0 +1,175 @@
+"""Least-squares adjustment of target poses to the raw pixels of their rings.
+
+All targets of a kind are adjusted at once, each on its own: six pose parameters, edge offset (in mm and in px) and blur per
+target, planar light levels per ring. Gauss-Newton with limited steps; robust weights against glare, dirt and occlusion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dishmap.camera.model import Camera
+from dishmap.targets.edges import LocalMaps, Poses, local_maps
+from dishmap.targets.pixels import BLUR, GEOMETRY, OFFSET_MM, OFFSET_PX, RingPixels, Rings, RingSums, State, Weighting, ring_sums, without_light
+from dishmap.transforms import rotation_from_vector
+
+Array = NDArray[np.float64]
+
+# A step moves no edge by more than this, so that the linear model holds (edges are about a blur wide).
+LARGEST_STEP_PX = 1.5
+LARGEST_TURN_RAD = 0.2
+SHARPEST_BLUR_PX, WIDEST_BLUR_PX = 0.3, 12.0
+# Converged when a step is under 3 % of the estimate's own sigma, or under 2e-5 px where sigma is smaller still.
+STEP_SIGMAS, STEP_PX = 0.03, 2e-5
+# A turn about the normal is unknown for targets of one centre; this prior merely keeps it at zero.
+NO_TURN_SIGMA_RAD = 1e-4
+
+
+@dataclass(frozen=True)
+class Priors:
+    """What is assumed of each target before its pixels are seen; sigma values, all broadcast to (T,).
+
+    normal (T, 3): expected normal in the camera frame, towards the camera; normal_sigma_rad (T,); offset_mm_sigma (ink spread),
+    offset_px_sigma (tone curve of the camera), blur_px and log_blur_sigma; turns_freely: the kind has one centre.
+    """
+
+    normal: Array
+    normal_sigma_rad: Array
+    offset_mm_sigma: float
+    offset_px_sigma: float
+    blur_px: float
+    log_blur_sigma: float
+    turns_freely: bool
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Fixed inputs of an adjustment of T targets of one kind."""
+
+    camera: Camera
+    curvature_per_mm: Array
+    reach_mm: float
+    rings: Rings
+    priors: Priors
+    anchor_px: Array
+    scale_px: Array
+
+    def maps(self, poses: Poses) -> LocalMaps:
+        """The local maps of the batch's targets at `poses`."""
+        return local_maps(self.camera, poses, self.curvature_per_mm, self.reach_mm, self.anchor_px, self.scale_px)
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """Result of `adjust`: poses, nuisances, and per target the normal matrix (T, G, G) with and without the priors,
+    in units of the noise variance; converged (T,); last pass's ring sums and residuals; noise_variance (T,) grey^2."""
+
+    poses: Poses
+    state: State
+    information: Array
+    data_information: Array
+    converged: NDArray[np.bool_]
+    sums: RingSums
+    residual: NDArray[np.float32]
+    noise_variance: Array
+    misfit_px: Array
+
+
+def by_target(values: Array, target: NDArray[np.int64], count: int) -> Array:
+    """Sum rows of `values` (M, ...) over the rings of each of `count` targets."""
+    out = np.zeros((count, *values.shape[1:]))
+    np.add.at(out, target, values)
+    return out
+
+
+def prior_terms(poses: Poses, state: State, priors: Priors) -> tuple[Array, Array]:
+    """Prior information (T, G) (diagonal) and the pull (T, G) towards the prior means at the present state."""
+    count = len(poses)
+    precision = np.full((count, GEOMETRY), 1e-12)
+    pull = np.zeros((count, GEOMETRY))
+    expected = np.einsum("tji,tj->ti", poses.rotation, priors.normal)
+    precision[:, 3:5] = priors.normal_sigma_rad[:, None] ** -2.0
+    # turning about x by a tips the normal to (0, -a), about y by b to (b, 0)
+    pull[:, 3], pull[:, 4] = -expected[:, 1], expected[:, 0]
+    if priors.turns_freely:
+        precision[:, 5] = NO_TURN_SIGMA_RAD**-2
+    for column, value, mean, sigma in (
+        (OFFSET_MM, state.offset_mm, 0.0, priors.offset_mm_sigma),
+        (OFFSET_PX, state.offset_px, 0.0, priors.offset_px_sigma),
+        (BLUR, state.blur_px, priors.blur_px, priors.log_blur_sigma * priors.blur_px),
+    ):
+        precision[:, column] = sigma**-2
+        pull[:, column] = mean - value
+    return precision, precision * pull
+
+
+def adjust(batch: Batch, pixels: RingPixels, poses: Poses, state: State, weighting: Weighting, steps: int) -> Adjusted:
+    """Run up to `steps` Gauss-Newton steps from `poses` and `state`, until every target has converged."""
+    count = len(poses)
+    converged = np.zeros(count, bool)
+    maps = batch.maps(poses)
+    for step in range(steps + 1):
+        sums, residual = ring_sums(pixels, batch.rings, maps, state, weighting)
+        freedom = np.maximum(by_target(sums.weight, pixels.target, count) - GEOMETRY, 1.0)
+        variance = np.maximum(by_target(sums.square, pixels.target, count) / freedom, 1e-12)
+        normal, right = without_light(sums)
+        data = by_target(normal, pixels.target, count) / variance[:, None, None]
+        precision, pull = prior_terms(poses, state, batch.priors)
+        information = data.copy()
+        information[:, range(GEOMETRY), range(GEOMETRY)] += precision
+        if step == steps:
+            break
+        delta = solve_scaled(information, by_target(right, pixels.target, count) / variance[:, None] + pull)
+        sigmas = np.sqrt(np.maximum(np.einsum("tg,tgh,th->t", delta, information, delta) / GEOMETRY, 0))
+        move_px = _largest_motion_px(delta, maps, poses)
+        converged = (sigmas < STEP_SIGMAS) | (move_px < STEP_PX)
+        turn = np.linalg.norm(delta[:, 3:6], axis=1)
+        limit = np.minimum(1.0, np.minimum(LARGEST_STEP_PX / np.maximum(move_px, 1e-9), LARGEST_TURN_RAD / np.maximum(turn, 1e-9)))
+        poses, state = _moved(poses, state, delta * np.nan_to_num(limit)[:, None])
+        if converged.all():
+            # the last step was a small part of sigma: the sums before it serve as those after it
+            break
+        maps = batch.maps(poses)
+    good = converged & np.isfinite(poses.position_mm).all(axis=1)
+    return Adjusted(poses, state, information, data, good, sums, residual, variance, maps.misfit_px)
+
+
+def solve_scaled(matrix: Array, right: Array) -> Array:
+    """Solve (T, G, G) x = (T, G) after scaling to unit diagonal; a singular or NaN system gives zeros."""
+    scale = 1 / np.sqrt(np.maximum(np.diagonal(matrix, axis1=1, axis2=2), 1e-300))
+    scaled = matrix * scale[:, :, None] * scale[:, None, :]
+    bad = ~(np.isfinite(scaled).all(axis=(1, 2)) & np.isfinite(right).all(axis=1))
+    scaled[bad] = np.eye(matrix.shape[-1])
+    scaled += 1e-12 * np.eye(matrix.shape[-1])
+    out = np.linalg.solve(scaled, (np.where(bad[:, None], 0.0, right) * scale)[..., None])[..., 0] * scale
+    return np.where(bad[:, None], 0.0, out)
+
+
+def inverse_scaled(matrix: Array) -> Array:
+    """Inverse (T, G, G) of positive definite matrices after scaling to unit diagonal; NaN where not finite."""
+    scale = 1 / np.sqrt(np.maximum(np.diagonal(matrix, axis1=1, axis2=2), 1e-300))
+    scaled = matrix * scale[:, :, None] * scale[:, None, :]
+    bad = ~np.isfinite(scaled).all(axis=(1, 2))
+    scaled[bad] = np.eye(matrix.shape[-1])
+    out = np.linalg.inv(scaled + 1e-13 * np.eye(matrix.shape[-1])) * scale[:, :, None] * scale[:, None, :]
+    out[bad] = np.nan
+    return out
+
+
+def _largest_motion_px(delta: Array, maps: LocalMaps, poses: Poses) -> Array:
+    """Rough bound on how far a step moves any printed point, px, plus how much it changes blur and offset."""
+    constant = np.einsum("tkg,tg->tk", maps.motion[:, 0], delta[:, :6])
+    linear = np.einsum("tlkg,tg->tlk", maps.motion[:, 1:3], delta[:, :6])
+    image = np.linalg.norm(constant, axis=1) + np.linalg.norm(linear, axis=(1, 2))
+    return np.asarray(image + np.abs(delta[:, OFFSET_PX]) + np.abs(delta[:, BLUR]))
+
+
+def _moved(poses: Poses, state: State, delta: Array) -> tuple[Poses, State]:
+    position = poses.position_mm + np.einsum("tij,tj->ti", poses.steps, delta[:, :3])
+    rotation = poses.rotation @ rotation_from_vector(delta[:, 3:6])
+    blur = np.clip(state.blur_px * np.exp(np.clip(delta[:, BLUR] / state.blur_px, -0.5, 0.5)), SHARPEST_BLUR_PX, WIDEST_BLUR_PX)
+    moved = replace(state, offset_mm=state.offset_mm + delta[:, OFFSET_MM], offset_px=state.offset_px + delta[:, OFFSET_PX], blur_px=blur)
+    return Poses(rotation, position), moved

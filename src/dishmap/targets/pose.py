@@ -1,0 +1,250 @@
+"""Pose of every named target from the raw pixels, with covariance (method `pose`).
+
+The chain: nominal pose -> detected ellipses -> coarse fit to every fourth pixel of a wide band -> what the whole picture
+says of blur, noise and of how far normals stray from the pattern's surface -> full fit to all pixels of the band.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dishmap.camera.model import Camera
+from dishmap.errors import CameraError, ImageError, MeasurementError
+from dishmap.quality import Quality, is_rejected, names
+from dishmap.targets.adjust import Adjusted, by_target, inverse_scaled
+from dishmap.targets.detect import Detections
+from dishmap.targets.identify import Identity
+from dishmap.targets.pattern import Pattern
+from dishmap.targets.pixels import GEOMETRY, OFFSET_MM, OFFSET_PX, RingPixels
+from dishmap.targets.scene_noise import NoiseModel, noise_model
+from dishmap.targets.sensitivity import calibration_jacobian, mirror_evidence
+from dishmap.targets.stages import Assumptions, Group, Shared, coarse_fit, full_fit, learn, regroup, start_groups
+from dishmap.targets.start import centers_of
+from dishmap.targets.window import sharpest_curvature_per_px
+from dishmap.transforms import Pose, angle_between_rad
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+SMALLEST_RADIUS_PX = 2.0
+# Share of the edge that must be left: below the first the target is flagged, below the second it is not measured.
+OCCLUDED_BELOW, HIDDEN_BELOW = 0.97, 0.5
+# Residual variance over the photograph's noise at which the model is said not to fit, and the least contrast in sigmas.
+POOR_FIT_RATIO, LEAST_CONTRAST_SIGMAS = 2.5, 4.0
+# Mirrored poses whose chi-square would differ by less than this (3 sigma) cannot be told apart.
+MIRROR_CHI_SQUARE = 9.0
+# Depth leans on the assumed edge offset when knowing the offset would shrink its sigma by more than this.
+WEAK_DEPTH_RATIO = 2.0
+
+
+@dataclass(frozen=True)
+class TargetPoses:
+    """Measured targets (N,), in the camera frame.
+
+    index: place in the pattern; ids; position_mm, normal (N, 3), normal towards the camera; rotation (N, 3, 3)
+    camera_from_target; covariance (N, 6, 6) of (move along camera axes in mm, turn about target axes in rad) from this
+    photograph's noise; center_px (N, 2) and covariance_px2 (N, 2, 2) of the projected target centre; sigma_normal_rad (N,)
+    root mean square angle; calibration_jacobian (N, 3, P) d position / d camera parameters; blur_px (N,) total blur,
+    offset_mm (N,) edge offset, contrast, noise (N,) grey levels; kept (N,) smallest share of a circle's edge that was used;
+    quality (N,) bits of `Quality`.
+    camera_from_dish: rigid pose of the undeformed pattern; normal_sigma_rad: spread of normals about the pattern's surface,
+    used as a prior; noise_model: of the photograph; rejected: (id, reason) of named targets that could not be measured.
+    """
+
+    index: Index
+    ids: Index
+    position_mm: Array
+    normal: Array
+    rotation: Array
+    covariance: Array
+    center_px: Array
+    covariance_px2: Array
+    sigma_normal_rad: Array
+    calibration_jacobian: Array
+    blur_px: Array
+    offset_mm: Array
+    contrast: Array
+    noise: Array
+    kept: Array
+    quality: Index
+    camera_from_dish: Pose
+    normal_sigma_rad: float
+    noise_model: NoiseModel
+    rejected: tuple[tuple[int, str], ...]
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+def measure_targets(
+    image: NDArray[np.generic],
+    camera: Camera,
+    pattern: Pattern,
+    detections: Detections,
+    identity: Identity,
+    assumptions: Assumptions | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> TargetPoses:
+    """Measure the pose of every named target from the raw pixels of `image` (H, W), any real dtype.
+
+    `detections` and `identity` come from `find_ellipses` and `identify`. Targets that cannot be measured are listed in
+    `rejected` with the reason. Raises ImageError if the image holds NaN, CameraError if its size is not the camera's,
+    MeasurementError if no target can be measured. `progress(done, total)` is called after each group of targets.
+    """
+    check_image(image, camera)
+    assumptions = assumptions or Assumptions()
+    groups, rejected = start_groups(camera, pattern, detections, identity, assumptions)
+    total = 2 * len(groups)
+    tell = progress or (lambda done, total: None)
+    coarse = []
+    for group in groups:
+        fit = coarse_fit(image, group)
+        if not np.isfinite(fit.adjusted.poses.position_mm).all():
+            good = np.isfinite(fit.adjusted.poses.position_mm).all(axis=(1,))
+            rejected += [(int(pattern.ids[i]), "its pixels do not look like the printed target") for i in group.index[~good]]
+            if not good.any():
+                continue
+            fit = coarse_fit(image, regroup(group, good))
+        coarse.append(fit)
+        tell(len(coarse), total)
+    if not coarse:
+        raise MeasurementError("no named target lies wholly inside the image; move the camera back or turn it so that whole targets are seen")
+    shared = learn(camera, pattern, identity.camera_from_dish, coarse, assumptions)
+    fits = []
+    for fit in coarse:
+        fits.append(full_fit(image, pattern, fit, shared))
+        tell(len(coarse) + len(fits), total)
+    return _collect(image, pattern, fits, shared, rejected)
+
+
+def check_image(image: NDArray[np.generic], camera: Camera) -> None:
+    """Raise ImageError or CameraError unless `image` is a grey picture of the camera's size without NaN."""
+    if image.ndim != 2 or not image.size:
+        raise ImageError(f"the image must be one grey picture (height, width), not an array of shape {image.shape}")
+    if image.shape != (camera.height_px, camera.width_px):
+        size = f"{image.shape[1]}x{image.shape[0]}"
+        raise CameraError(
+            f"the photograph is {size} px but the camera was calibrated at {camera.width_px}x{camera.height_px} px; "
+            "use the camera file made for photographs of this size, without cropping or scaling"
+        )
+    if image.dtype.kind == "f" and not np.isfinite(image).all():
+        raise ImageError("the image holds NaN or infinite pixels; give finite grey levels")
+
+
+def _collect(
+    image: NDArray[np.generic], pattern: Pattern, fits: list[tuple[Group, Adjusted, RingPixels]], shared: Shared, rejected: list[tuple[int, str]]
+) -> TargetPoses:
+    blocks = [p.shape is None for _, _, p in fits]
+    pooled = noise_model([p.grey for _, _, p in fits], [a.residual for _, a, _ in fits], [p.used for _, _, p in fits], blocks)
+    noise = replace(shared.noise, inflation=pooled.inflation)
+    parts = [_results(image, group, adjusted, pixels, noise) for group, adjusted, pixels in fits]
+    every = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    order = np.argsort(every["index"])
+    every = {name: values[order] for name, values in every.items()}
+    bits = every["quality"]
+    out = is_rejected(bits) | (every["kept"] < HIDDEN_BELOW)
+    for i in np.flatnonzero(out):
+        why = names(int(bits[i] & ~0)) if is_rejected(bits[i]) else "more than half of one of its edges is hidden"
+        rejected.append((int(pattern.ids[every["index"][i]]), why.replace("|", ", ").replace("_", " ")))
+    kept = {name: values[~out] for name, values in every.items()}
+    return TargetPoses(
+        ids=pattern.ids[kept["index"]],
+        camera_from_dish=shared.camera_from_dish,
+        normal_sigma_rad=shared.normal_sigma_rad,
+        noise_model=noise,
+        rejected=tuple(sorted(rejected)),
+        **kept,
+    )
+
+
+def _results(image: NDArray[np.generic], group: Group, adjusted: Adjusted, pixels: RingPixels, noise: NoiseModel) -> dict[str, Array]:
+    """Columns of TargetPoses for one group, keyed by field name."""
+    count, batch, poses = len(group.index), group.batch, adjusted.poses
+    data = adjusted.data_information / noise.inflation
+    prior = adjusted.information - adjusted.data_information
+    covariance = inverse_scaled(data + prior)
+    pose_covariance = covariance[:, :6, :6]
+    steps = poses.steps
+    turned = np.zeros((count, 6, 6))
+    turned[:, :3, :3], turned[:, 3:, 3:] = steps, np.eye(3)
+    center, by_pose = centers_of(batch.camera, poses, batch.curvature_per_mm)
+    number = np.maximum(np.bincount(pixels.target, minlength=count), 1)
+    light = by_target(adjusted.sums.light, pixels.target, count) / number[:, None]
+    contrast = light[:, 0] - light[:, 3]
+    sigma = np.sqrt(noise.variance(np.maximum(light[:, 0], 1.0)) * adjusted.noise_variance)
+    edge_information = contrast**2 / (2 * np.sqrt(np.pi) * np.maximum(sigma, 1e-6) ** 2 * adjusted.state.blur_px * noise.inflation)
+    evidence, mirrored = mirror_evidence(batch, group.kind, poses, edge_information)
+    columns = {
+        "index": group.index,
+        "position_mm": poses.position_mm,
+        "normal": poses.rotation[..., 2],
+        "rotation": poses.rotation,
+        "covariance": turned @ pose_covariance @ np.swapaxes(turned, 1, 2),
+        "center_px": center,
+        "covariance_px2": by_pose @ pose_covariance @ np.swapaxes(by_pose, 1, 2),
+        "sigma_normal_rad": np.sqrt(pose_covariance[:, 3, 3] + pose_covariance[:, 4, 4]),
+        "calibration_jacobian": calibration_jacobian(batch, group.kind, poses, edge_information),
+        "blur_px": adjusted.state.blur_px,
+        "offset_mm": adjusted.state.offset_mm,
+        "contrast": contrast,
+        "noise": sigma,
+        "kept": _kept(adjusted, pixels, count),
+    }
+    columns["quality"] = _quality(image, group, adjusted, pixels, columns, data + prior, evidence, mirrored)
+    return columns
+
+
+def _kept(adjusted: Adjusted, pixels: RingPixels, count: int) -> Array:
+    """Smallest share of any circle's edge that was used, over the rings that were not left out."""
+    out = np.ones(count)
+    seen = pixels.used.any(axis=1)
+    np.minimum.at(out, pixels.target[seen], adjusted.sums.kept[seen].min(axis=1))
+    return np.where(np.bincount(pixels.target[seen], minlength=count) > 0, out, 0.0)
+
+
+def _quality(image, group: Group, adjusted: Adjusted, pixels: RingPixels, columns: dict[str, Array], information: Array, evidence: Array, mirrored: Array) -> Index:
+    count = len(group.index)
+    bits = np.zeros(count, np.int64)
+
+    def flag(where: Array, bit: Quality) -> None:
+        bits[where] |= int(bit)
+
+    outlines = group.outlines()
+    flag(~group.batch.camera.contains(outlines, margin_px=1.0).all(axis=(1, 2)), Quality.CLIPPED)
+    flag(~adjusted.converged, Quality.NOT_CONVERGED)
+    flag(columns["contrast"] < LEAST_CONTRAST_SIGMAS * columns["noise"], Quality.NO_CONTRAST)
+    flag(adjusted.noise_variance > POOR_FIT_RATIO, Quality.POOR_FIT)
+    across = np.linalg.norm(outlines - outlines.mean(axis=2, keepdims=True), axis=3).min(axis=2)
+    flag((across < SMALLEST_RADIUS_PX).any(axis=1), Quality.TOO_SMALL)
+    bright, lost = _lost_edges(image, adjusted, pixels, count)
+    dropped = np.bincount(pixels.target[~pixels.used.any(axis=1)], minlength=count) > 0
+    flag(lost & bright, Quality.GLARE)
+    flag((lost & ~bright) | dropped, Quality.OCCLUDED)
+    priors = group.batch.priors
+    normal = columns["normal"]
+    prior = (angle_between_rad(mirrored, priors.normal) ** 2 - angle_between_rad(normal, priors.normal) ** 2) / priors.normal_sigma_rad**2
+    apart = angle_between_rad(normal, mirrored) > 2 * columns["sigma_normal_rad"]
+    flag((evidence + prior < MIRROR_CHI_SQUARE) & apart, Quality.AMBIGUOUS_NORMAL)
+    known = [i for i in range(GEOMETRY) if i not in (OFFSET_MM, OFFSET_PX)]
+    free = inverse_scaled(information)[:, 2, 2]
+    fixed = inverse_scaled(information[:, known][:, :, known])[:, 2, 2]
+    flag(free > WEAK_DEPTH_RATIO**2 * fixed, Quality.WEAK_DEPTH)
+    return bits
+
+
+def _lost_edges(image, adjusted: Adjusted, pixels: RingPixels, count: int) -> tuple[Array, Array]:
+    """Whether what is in front of each target is brighter than the model (T,), and whether any edge was lost (T,)."""
+    lost = np.zeros(count, bool)
+    seen = pixels.used.any(axis=1)
+    np.logical_or.at(lost, pixels.target[seen], adjusted.sums.kept[seen].min(axis=1) < OCCLUDED_BELOW)
+    extreme = np.where(pixels.used, adjusted.residual, 0.0)
+    highest, lowest = np.zeros(count), np.zeros(count)
+    np.maximum.at(highest, pixels.target, extreme.max(axis=1))
+    np.minimum.at(lowest, pixels.target, extreme.min(axis=1))
+    full = np.iinfo(image.dtype).max if image.dtype.kind in "ui" else np.inf
+    saturated = by_target(((pixels.grey >= full) & pixels.used).mean(axis=1)[:, None], pixels.target, count)[:, 0] > 0.02
+    return (highest > -lowest) | saturated, lost | saturated

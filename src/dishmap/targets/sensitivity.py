@@ -1,0 +1,87 @@
+"""How a measured pose would change: with the camera's parameters, and against its mirrored twin."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dishmap.targets.adjust import Batch, solve_scaled
+from dishmap.targets.edges import Poses, printed_points, project_printed
+from dishmap.targets.pattern import TargetKind
+from dishmap.targets.window import OUTLINE_POINTS
+from dishmap.transforms import rotation_from_vector
+
+Array = NDArray[np.float64]
+
+MIRROR_STEPS = 4
+
+
+def _outline_samples(kind: TargetKind) -> tuple[Array, Array]:
+    """Printed positions (Q, 2) around all circles, and the mm of edge each stands for (Q,)."""
+    angle = 2 * np.pi * (np.arange(OUTLINE_POINTS) + 0.5) / OUTLINE_POINTS
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    xy = (kind.center_mm[:, None] + kind.radius_mm[:, None, None] * circle).reshape(-1, 2)
+    return xy, np.repeat(2 * np.pi * kind.radius_mm / OUTLINE_POINTS, OUTLINE_POINTS)
+
+
+def _edge_normals(pixels: Array, kind: TargetKind) -> tuple[Array, Array]:
+    """Unit normals (T, Q, 2) of projected outlines and px of edge per sample (T, Q), by differences along each circle."""
+    around = pixels.reshape(len(pixels), len(kind.radius_mm), OUTLINE_POINTS, 2)
+    along = 0.5 * (np.roll(around, -1, axis=2) - np.roll(around, 1, axis=2)).reshape(pixels.shape)
+    length = np.maximum(np.linalg.norm(along, axis=2), 1e-9)
+    return np.stack([along[..., 1], -along[..., 0]], axis=-1) / length[..., None], length
+
+
+def calibration_jacobian(batch: Batch, kind: TargetKind, poses: Poses, edge_information: Array) -> Array:
+    """d position (camera frame, mm) / d camera parameters (T, 3, P): how the fit follows when the camera is a little different.
+
+    edge_information (T,): information per px of edge (1 / px^2 per px), so that the prior on normals has its due weight.
+    """
+    xy, _ = _outline_samples(kind)
+    pixels, motion = project_printed(batch.camera, poses, batch.curvature_per_mm, xy)
+    local = printed_points(xy, batch.curvature_per_mm)
+    points = poses.position_mm[:, None] + np.einsum("tij,tqj->tqi", poses.rotation, local)
+    _, _, by_camera = batch.camera.project_with_jacobians(points)
+    normals, length = _edge_normals(pixels, kind)
+    pose_columns = np.einsum("tqk,tqkp->tqp", normals, motion)
+    camera_columns = np.einsum("tqk,tqkc->tqc", normals, by_camera)
+    weighted = pose_columns * (length * edge_information[:, None])[..., None]
+    information = np.swapaxes(weighted, 1, 2) @ pose_columns
+    information[:, [3, 4], [3, 4]] += batch.priors.normal_sigma_rad[:, None] ** -2.0
+    information[:, 5, 5] += 1e-6 + (1e8 if batch.priors.turns_freely else 0.0)
+    change = -np.linalg.solve(information, np.swapaxes(weighted, 1, 2) @ camera_columns)
+    return poses.steps @ change[:, :3]
+
+
+def mirror_evidence(batch: Batch, kind: TargetKind, poses: Poses, edge_information: Array) -> tuple[Array, Array]:
+    """Rise of chi-square (T,) that pixels would show at the mirrored pose, and the mirrored normals (T, 3).
+
+    Under weak perspective a plane and its mirror image about the line of sight look alike (Schweighofer and Pinz 2006);
+    what tells them apart is the little perspective within the target.
+    """
+    ray = poses.position_mm / np.linalg.norm(poses.position_mm, axis=1, keepdims=True)
+    normal = poses.rotation[..., 2]
+    mirrored = 2 * (normal * ray).sum(axis=1, keepdims=True) * ray - normal
+    axis = np.cross(normal, mirrored)
+    sine = np.linalg.norm(axis, axis=1, keepdims=True)
+    angle = np.arctan2(sine, (normal * mirrored).sum(axis=1, keepdims=True))
+    turn = rotation_from_vector(axis / np.maximum(sine, 1e-15) * angle)
+    other = Poses(turn @ poses.rotation, poses.position_mm)
+    xy, _ = _outline_samples(kind)
+    seen, _ = project_printed(batch.camera, poses, batch.curvature_per_mm, xy)
+    normals, length = _edge_normals(seen, kind)
+    weight = length * edge_information[:, None]
+    for _ in range(MIRROR_STEPS):
+        pixels, motion = project_printed(batch.camera, other, batch.curvature_per_mm, xy)
+        gap = np.einsum("tqk,tqk->tq", normals, seen - pixels)
+        columns = np.einsum("tqk,tqkp->tqp", normals, motion)
+        weighted = np.swapaxes(columns * weight[..., None], 1, 2)
+        information = weighted @ columns
+        information[:, range(6), range(6)] += 1e-9 * np.maximum(np.trace(information, axis1=1, axis2=2), 1e-9)[:, None]
+        delta = solve_scaled(information, (weighted @ gap[..., None])[..., 0])
+        delta[:, 3:] = np.clip(delta[:, 3:], -0.1, 0.1)
+        position = other.position_mm + np.einsum("tij,tj->ti", other.steps, delta[:, :3])
+        other = Poses(other.rotation @ rotation_from_vector(delta[:, 3:]), position)
+    pixels, _ = project_printed(batch.camera, other, batch.curvature_per_mm, xy)
+    gap = np.einsum("tqk,tqk->tq", normals, seen - pixels)
+    return (weight * gap * gap).sum(axis=1), other.rotation[..., 2]

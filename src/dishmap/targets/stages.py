@@ -1,0 +1,296 @@
+"""The stages of measuring targets: start from ellipses, coarse fit, what all targets share, full fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dishmap.camera.model import Camera
+from dishmap.targets.adjust import Adjusted, Batch, Priors, adjust, by_target, inverse_scaled
+from dishmap.targets.detect import Detections
+from dishmap.targets.edges import Poses
+from dishmap.targets.identify import Identity
+from dishmap.targets.pattern import Pattern, TargetKind
+from dishmap.targets.pixels import BAND_BLURS, BAND_EXTRA_PX, RingPixels, State, Weighting, rings_of
+from dishmap.targets.scene_noise import ROBUST_TO_SIGMA, NoiseModel, noise_model
+from dishmap.targets.start import EllipsePoints, centers_of, ellipse_points, fit_ellipses, nominal_poses, pair_circles, rigid_pose
+from dishmap.targets.window import outline, ring_layout, ring_pixels
+from dishmap.transforms import Pose
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+# First guesses, wide enough for any sharp photograph.
+FIRST_BLUR_PX, FIRST_LOG_BLUR_SIGMA = 0.9, 1.0
+FIRST_BAND_BLUR_PX = 1.5
+FIRST_NORMAL_SIGMA_RAD = np.radians(12.0)
+COARSE_STRIDE = 4
+COARSE_STEPS, FULL_STEPS = 6, 8
+# Targets in one group: bounds memory, and keeps the windows of a group about equally large.
+GROUP_SIZE = 64
+# Residuals beyond this many sigma and this share of the contrast are not noise but glare, dirt or something in front.
+CUT_SIGMAS, CUT_CONTRAST = 6.0, 0.1
+# A ring of which less than this share of an edge survives is left out, when the target has others.
+LEAST_KEPT = 0.7
+# A normal farther than this from the surface (in sigmas of prior and data together) is left to the data alone.
+STRAY_SIGMAS = 4.0
+LEAST_NORMAL_SIGMA_RAD = np.radians(0.02)
+
+
+@dataclass(frozen=True)
+class Assumptions:
+    """What is assumed of print and camera; each is a sigma of a prior that the image can override.
+
+    ink_spread_fraction: how far printed edges may lie outwards, as a share of the kind's largest radius.
+    tone_shift_px: how far the camera's tone curve may shift a dark-light edge. normal_sigma_deg: how far targets' normals may
+    stray from the pattern's surface; None learns it from the photograph.
+    """
+
+    ink_spread_fraction: float = 0.02
+    tone_shift_px: float = 0.3
+    normal_sigma_deg: float | None = None
+
+
+@dataclass(frozen=True)
+class Group:
+    """Targets of one kind and similar size in the image that are adjusted together."""
+
+    kind: TargetKind
+    index: Index
+    poses: Poses
+    batch: Batch
+    state: State
+
+    def outlines(self) -> Array:
+        """Projected outlines of all circles (T, C, Q, 2) at the group's poses."""
+        return outline(self.batch.camera, self.poses, self.batch.curvature_per_mm, self.kind.center_mm, self.kind.radius_mm)
+
+
+@dataclass(frozen=True)
+class Coarse:
+    """A group after the coarse fit, with what it says per ring: cut (M,) of residuals, kept (M, C)."""
+
+    group: Group
+    adjusted: Adjusted
+    pixels: RingPixels
+    cut: Array
+
+
+@dataclass(frozen=True)
+class Shared:
+    """What all targets of the photograph share: rigid pose, noise, normal sigma."""
+
+    camera_from_dish: Pose
+    noise: NoiseModel
+    normal_sigma_rad: float
+
+
+def start_groups(
+    camera: Camera, pattern: Pattern, detections: Detections, identity: Identity, assumptions: Assumptions
+) -> tuple[list[Group], list[tuple[int, str]]]:
+    """First poses of all named targets, in groups; and (id, reason) of those that reach beyond the image."""
+    groups: list[Group] = []
+    rejected: list[tuple[int, str]] = []
+    owner = pattern.marks.target[identity.mark]
+    for name, kind in pattern.kinds.items():
+        index = np.array([i for i in np.unique(owner) if pattern.kind_names[i] == name], dtype=np.int64)
+        if not len(index):
+            continue
+        poses = nominal_poses(pattern, index, identity.camera_from_dish)
+        order = np.argsort(np.linalg.norm(poses.position_mm, axis=1), kind="stable")
+        for begin in range(0, len(order), GROUP_SIZE):
+            part = order[begin : begin + GROUP_SIZE]
+            group = _first_group(camera, pattern, kind, index[part], poses.take(part), assumptions)
+            group = _on_ellipses(group, pattern, detections, identity)
+            inside = camera.contains(group.outlines(), margin_px=1.0).all(axis=(1, 2))
+            rejected += [(int(pattern.ids[i]), "it reaches beyond the image") for i in group.index[~inside]]
+            if inside.any():
+                groups.append(regroup(group, inside))
+    return groups, rejected
+
+
+def regroup(group: Group, keep: Bool) -> Group:
+    """The targets `keep` of a group, with local maps about their present places."""
+    priors = group.batch.priors
+    priors = replace(priors, normal=priors.normal[keep], normal_sigma_rad=priors.normal_sigma_rad[keep])
+    batch = replace(group.batch, priors=priors, curvature_per_mm=group.batch.curvature_per_mm[keep])
+    state = State(*(v[keep] for v in (group.state.offset_mm, group.state.offset_px, group.state.blur_px)))
+    poses = group.poses.take(keep)
+    return Group(group.kind, group.index[keep], poses, _placed(batch, group.kind, poses), state)
+
+
+def _first_group(camera: Camera, pattern: Pattern, kind: TargetKind, index: Index, poses: Poses, assumptions: Assumptions) -> Group:
+    count = len(index)
+    priors = Priors(
+        normal=poses.rotation[..., 2],
+        normal_sigma_rad=np.full(count, FIRST_NORMAL_SIGMA_RAD),
+        offset_mm_sigma=assumptions.ink_spread_fraction * float(kind.radius_mm.max()),
+        offset_px_sigma=assumptions.tone_shift_px,
+        blur_px=FIRST_BLUR_PX,
+        log_blur_sigma=FIRST_LOG_BLUR_SIGMA,
+        turns_freely=kind.turns_freely,
+    )
+    batch = Batch(camera, pattern.curvature_per_mm[index], kind.extent_mm, rings_of(kind), priors, np.zeros((count, 2)), np.ones(count))
+    zero = np.zeros(count)
+    return Group(kind, index, poses, _placed(batch, kind, poses), State(zero, zero, np.full(count, FIRST_BLUR_PX)))
+
+
+def _placed(batch: Batch, kind: TargetKind, poses: Poses, blur_px: float = FIRST_BAND_BLUR_PX) -> Batch:
+    """The batch with local maps anchored at the present poses, reaching over ink and band."""
+    ends = outline(batch.camera, poses, batch.curvature_per_mm, np.zeros((1, 2)), np.array([kind.extent_mm]))[:, 0]
+    center, _ = centers_of(batch.camera, poses, batch.curvature_per_mm)
+    half = np.linalg.norm(ends - center[:, None], axis=2)
+    band = BAND_BLURS * blur_px + BAND_EXTRA_PX + 2.0
+    narrow = np.nan_to_num(half.min(axis=1), nan=np.inf)
+    reach = kind.extent_mm * (1 + band / max(float(narrow.min()), 1.0))
+    scale = np.nan_to_num(half.max(axis=1), nan=1.0) * reach / kind.extent_mm
+    return replace(batch, reach_mm=reach, anchor_px=np.round(np.nan_to_num(center)), scale_px=np.maximum(scale, 1.0))
+
+
+def _on_ellipses(group: Group, pattern: Pattern, detections: Detections, identity: Identity) -> Group:
+    marks = pattern.marks
+    place = np.full(len(pattern), -1)
+    place[group.index] = np.arange(len(group.index))
+    mine = place[marks.target[identity.mark]] >= 0
+    mark, detection = identity.mark[mine], identity.detection[mine]
+    rows = np.array(pair_circles(group.kind, marks.circle[mark], detection, detections.parent, detections.semi_axes_px))
+    ellipse = rows[:, 2]
+    points = ellipse_points(detections.center_px[ellipse], detections.semi_axes_px[ellipse], detections.angle_rad[ellipse])
+    target = place[marks.target[mark]][rows[:, 0]]
+    # the nominal pose can be many pixels off on a bent surface: bring each target over its ellipses first
+    poses = _shifted(group, points, target, rows[:, 1])
+    batch = _placed(group.batch, group.kind, poses)
+    poses = fit_ellipses(batch, group.kind, poses, EllipsePoints(points, target, rows[:, 1]))
+    return replace(group, poses=poses, batch=_placed(batch, group.kind, poses))
+
+
+def _shifted(group: Group, points: Array, target: Index, circle: Index) -> Poses:
+    """Poses moved sideways so that the projected circles' middles lie on the ellipses' middles, on average."""
+    outlines = group.outlines().mean(axis=2)
+    gap = points.mean(axis=1) - outlines[target, circle]
+    count = np.maximum(np.bincount(target, minlength=len(group.poses)), 1)[:, None]
+    shift = by_target(gap, target, len(group.poses)) / count
+    camera = group.batch.camera
+    center, _ = centers_of(camera, group.poses, group.batch.curvature_per_mm)
+    distance = np.linalg.norm(group.poses.position_mm, axis=1, keepdims=True)
+    position = camera.unproject(center + np.nan_to_num(shift)) * distance
+    return Poses(group.poses.rotation, np.where(np.isfinite(position), position, group.poses.position_mm))
+
+
+def layout(image: NDArray[np.generic], group: Group, blur_px: float, band_blur_px: float) -> tuple[Batch, RingPixels]:
+    """Rings and pixels of a group for a given blur, in a band wide enough for `band_blur_px`."""
+    batch = _placed(group.batch, group.kind, group.poses, band_blur_px)
+    outlines = group.outlines()
+    across = np.linalg.norm(outlines - outlines.mean(axis=2, keepdims=True), axis=3).min(axis=2)
+    rings, members, fine = ring_layout(group.kind, outlines, across / group.kind.radius_mm, blur_px)
+    batch = replace(batch, rings=rings)
+    return batch, ring_pixels(image, rings, batch.maps(group.poses), outlines, members, band_blur_px, fine)
+
+
+def coarse_fit(image: NDArray[np.generic], group: Group) -> Coarse:
+    """Fit every fourth pixel of a wide band, first all of them, then without outliers."""
+    batch, pixels = layout(image, group, FIRST_BLUR_PX, FIRST_BAND_BLUR_PX)
+    pixels = pixels.every(COARSE_STRIDE)
+    first = adjust(batch, pixels, group.poses, group.state, Weighting(1.0, 0.0, None), COARSE_STEPS)
+    cut = residual_cut(first, pixels)
+    second = adjust(batch, pixels, first.poses, first.state, Weighting(1.0, 0.0, cut), COARSE_STEPS)
+    return Coarse(replace(group, poses=second.poses, state=second.state, batch=batch), second, pixels, residual_cut(second, pixels))
+
+
+def residual_cut(adjusted: Adjusted, pixels: RingPixels) -> Array:
+    """Residual (M,) in grey levels beyond which a pixel of a ring is an outlier."""
+    absolute = np.where(pixels.used, np.abs(adjusted.residual), np.nan)
+    with np.errstate(all="ignore"):
+        sigma = ROBUST_TO_SIGMA * np.nan_to_num(_nan_median(absolute), nan=1.0)
+    contrast = np.abs(adjusted.sums.light[:, 0] - adjusted.sums.light[:, 3])
+    return np.maximum(np.maximum(CUT_SIGMAS * sigma, CUT_CONTRAST * contrast), 1.0)
+
+
+def _nan_median(values: Array) -> Array:
+    """Median of each row without NaN; NaN sorts last."""
+    ordered = np.sort(values, axis=1)
+    middle = np.maximum(np.isfinite(values).sum(axis=1) - 1, 0) // 2
+    return ordered[np.arange(len(values)), middle]
+
+
+def learn(camera: Camera, pattern: Pattern, start: Pose, coarse: list[Coarse], assumptions: Assumptions) -> Shared:
+    """Rigid pose of the pattern, noise of the photograph, and how far normals stray, from all coarse fits."""
+    index = np.concatenate([c.group.index for c in coarse])
+    centers = np.concatenate([centers_of(camera, c.group.poses, c.group.batch.curvature_per_mm)[0] for c in coarse])
+    good = np.isfinite(centers).all(axis=1)
+    pose = rigid_pose(pattern, index[good], camera, centers[good], start) if good.sum() >= 4 else start
+    noise = noise_model([c.pixels.grey for c in coarse], [c.adjusted.residual for c in coarse], [c.pixels.used for c in coarse], [False] * len(coarse))
+    if assumptions.normal_sigma_deg is not None:
+        return Shared(pose, noise, max(np.radians(assumptions.normal_sigma_deg), LEAST_NORMAL_SIGMA_RAD))
+    tilt, covariance = zip(*(free_tilt(c, pose.rotation @ pattern.normal[c.group.index].T) for c in coarse), strict=True)
+    return Shared(pose, noise, normal_spread(np.concatenate(tilt), np.concatenate(covariance)))
+
+
+def free_tilt(coarse: Coarse, expected: Array) -> tuple[Array, Array]:
+    """Tilt (T, 2) of the targets from the expected normals (3, T), about their own axes, and its covariance from data alone."""
+    adjusted = coarse.adjusted
+    posterior = inverse_scaled(adjusted.information)[:, 3:5, 3:5]
+    tips = np.einsum("tji,jt->ti", adjusted.poses.rotation, expected)
+    tilt = np.stack([tips[:, 1], -tips[:, 0]], axis=1)
+    prior = np.einsum("tji,tj->ti", adjusted.poses.rotation, coarse.group.batch.priors.normal)
+    prior_tilt = np.stack([prior[:, 1], -prior[:, 0]], axis=1)
+    eye = np.eye(2) / FIRST_NORMAL_SIGMA_RAD**2
+    # take the first, wide prior out again: what is left is what the pixels alone say
+    data = np.linalg.inv(posterior) - eye
+    data += 1e-9 * np.eye(2) * np.maximum(np.trace(data, axis1=1, axis2=2), 1e-3)[:, None, None]
+    covariance = np.linalg.inv(data)
+    shift = np.einsum("tij,tj->ti", covariance, prior_tilt) / FIRST_NORMAL_SIGMA_RAD**2
+    return tilt + shift, covariance
+
+
+def normal_spread(tilt: Array, covariance: Array) -> float:
+    """Standard deviation (rad, per axis) of true tilts about the surface, by maximum likelihood over all targets.
+
+    Tilts are normal with covariance (data) + spread^2; the few that stray far are held at 4 sigma, so that one bent corner
+    does not loosen the whole surface.
+    """
+    good = np.isfinite(covariance).all(axis=(1, 2)) & (np.abs(tilt) < 2 * FIRST_NORMAL_SIGMA_RAD).all(axis=1)
+    if good.sum() < 4:
+        return float(FIRST_NORMAL_SIGMA_RAD)
+    values, vectors = np.linalg.eigh(covariance[good])
+    along = np.einsum("tji,tj->ti", vectors, tilt[good])
+    grid = np.geomspace(LEAST_NORMAL_SIGMA_RAD, FIRST_NORMAL_SIGMA_RAD, 60)
+    variance = np.maximum(values[None], 1e-14) + grid[:, None, None] ** 2
+    square = np.minimum(along[None] ** 2 / variance, STRAY_SIGMAS**2)
+    likelihood = -0.5 * (square + np.log(variance)).sum(axis=(1, 2))
+    return float(grid[np.argmax(likelihood)])
+
+
+def full_fit(image: NDArray[np.generic], pattern: Pattern, coarse: Coarse, shared: Shared) -> tuple[Group, Adjusted, RingPixels]:
+    """Fit all pixels of the band, with the photograph's noise and the surface's normals."""
+    group = coarse.group
+    expected = shared.camera_from_dish.rotate(pattern.normal[group.index])
+    tilt, covariance = free_tilt(coarse, expected.T)
+    width = covariance + shared.normal_sigma_rad**2 * np.eye(2)
+    stray = np.einsum("ti,tij,tj->t", tilt, np.linalg.inv(width), tilt) > STRAY_SIGMAS**2
+    sigma = np.where(stray, FIRST_NORMAL_SIGMA_RAD, shared.normal_sigma_rad)
+    blur = float(np.median(group.state.blur_px))
+    priors = replace(group.batch.priors, normal=expected, normal_sigma_rad=sigma, blur_px=blur)
+    group = replace(group, batch=replace(group.batch, priors=priors))
+    widest = float(np.quantile(group.state.blur_px, 0.9))
+    batch, pixels = layout(image, group, widest, widest)
+    group = replace(group, batch=batch)
+    cut, pixels = _without_bad_rings(coarse, pixels)
+    adjusted = adjust(batch, pixels, group.poses, group.state, Weighting(shared.noise.base, shared.noise.slope, cut), FULL_STEPS)
+    return replace(group, poses=adjusted.poses, state=adjusted.state), adjusted, pixels
+
+
+def _without_bad_rings(coarse: Coarse, pixels: RingPixels) -> tuple[Array, RingPixels]:
+    """Cuts (M,) for the pixels' rings, and the pixels without rings of which little can be seen."""
+    per_target = by_target(coarse.cut[:, None], coarse.pixels.target, len(coarse.group.poses))[:, 0]
+    number = np.bincount(coarse.pixels.target, minlength=len(per_target))
+    if len(pixels.ring) != len(coarse.pixels.ring):
+        return (per_target / number)[pixels.target], pixels
+    bad = coarse.adjusted.sums.kept.min(axis=1) < LEAST_KEPT
+    good = np.bincount(pixels.target, weights=~bad, minlength=len(per_target))
+    drop = bad & (good[pixels.target] > 0)
+    return coarse.cut, replace(pixels, used=pixels.used & ~drop[:, None])
+
