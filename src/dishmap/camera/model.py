@@ -115,24 +115,40 @@ class Camera:
         """
         return self._project(points_mm, derivatives=False)[0]
 
+    def project_with_point_jacobian(self, points_mm: ArrayLike) -> tuple[Array, Array]:
+        """Project points (..., 3): pixels (..., 2) and d pixels / d point (..., 2, 3)."""
+        pixels, by_point, _ = self._project(points_mm, derivatives=True, by_parameter=False)
+        return pixels, by_point
+
     def project_with_jacobians(self, points_mm: ArrayLike) -> tuple[Array, Array, Array]:
         """Project points (..., 3): pixels (..., 2), d pixels / d point (..., 2, 3), d pixels / d parameters (..., 2, P)."""
         return self._project(points_mm, derivatives=True)
 
-    def _project(self, points_mm: ArrayLike, derivatives: bool) -> tuple[Array, Array, Array]:
+    def _project(self, points_mm: ArrayLike, derivatives: bool, by_parameter: bool = True) -> tuple[Array, Array, Array]:
         p = np.asarray(points_mm, dtype=float)
         lens = _opencv_lens if self.model == "opencv" else _fisheye_lens
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            plane, by_point, by_coefficient = lens(p, self.distortion, self.widest, derivatives)
+            plane, by_point = lens(p, self.distortion, self.widest, derivatives)
         pixels = plane * self.focal_px + self.principal_px
         if not derivatives:
             return pixels, np.empty(0), np.empty(0)
         f = self.focal_px[:, None]
-        by_parameter = np.zeros((*p.shape[:-1], 2, 4 + self.distortion.size))
-        by_parameter[..., 0, 0], by_parameter[..., 1, 1] = plane[..., 0], plane[..., 1]
-        by_parameter[..., 0, 2] = by_parameter[..., 1, 3] = 1.0
-        by_parameter[..., 4:] = by_coefficient * f
-        return pixels, by_point * f, by_parameter
+        by_point = by_point * f
+        if not by_parameter:
+            return pixels, by_point, np.empty(0)
+        return pixels, by_point, self._by_parameter(p, plane)
+
+    def _by_parameter(self, p: Array, plane: Array) -> Array:
+        if self.model == "opencv":
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                by_coefficient = _by_coefficient(p[..., 0] / p[..., 2], p[..., 1] / p[..., 2], self.distortion)
+        else:
+            by_coefficient = _fisheye_by_coefficient(p)
+        out = np.zeros((*p.shape[:-1], 2, 4 + self.distortion.size))
+        out[..., 0, 0], out[..., 1, 1] = plane[..., 0], plane[..., 1]
+        out[..., 0, 2] = out[..., 1, 3] = 1.0
+        out[..., 4:] = by_coefficient * self.focal_px[:, None]
+        return out
 
     def unproject(self, pixels: ArrayLike) -> Array:
         """Unit rays (..., 3) in the camera frame through pixels (..., 2), to 1e-9 px; NaN where the lens has no inverse.
@@ -166,28 +182,30 @@ def _radial(distortion: Array, r2: Array) -> tuple[Array, Array]:
     return top / bottom, (slope_top - top / bottom * slope_bottom) / bottom
 
 
-def _opencv_lens(p: Array, distortion: Array, widest: float, derivatives: bool) -> tuple[Array, Array, Array]:
-    """Distorted plane coordinates (..., 2), by point (..., 2, 3), by coefficient (..., 2, K)."""
+def _opencv_lens(p: Array, distortion: Array, widest: float, derivatives: bool) -> tuple[Array, Array]:
+    """Distorted plane coordinates (..., 2), by point (..., 2, 3)."""
     z = p[..., 2]
     x, y = p[..., 0] / z, p[..., 1] / z
     bad = ~((z > 0) & (x * x + y * y <= widest * widest))
-    plane, by_plane = _distort(x, y, distortion)
+    plane, by_plane = _distort(x, y, distortion, derivatives)
     plane[bad] = np.nan
     if not derivatives:
-        return plane, np.empty(0), np.empty(0)
+        return plane, np.empty(0)
     by_point = np.empty((*p.shape[:-1], 2, 3))
     by_point[..., :2] = by_plane / z[..., None, None]
     by_point[..., 2] = -(by_point[..., 0] * x[..., None] + by_point[..., 1] * y[..., None])
-    return plane, by_point, _by_coefficient(x, y, distortion)
+    return plane, by_point
 
 
-def _distort(x: Array, y: Array, distortion: Array) -> tuple[Array, Array]:
+def _distort(x: Array, y: Array, distortion: Array, derivatives: bool = True) -> tuple[Array, Array]:
     """Distorted plane coordinates (..., 2) of undistorted x, y, and their 2x2 Jacobian."""
     _, _, p1, p2, *_, s1, s2, s3, s4 = _padded(distortion)
     r2 = x * x + y * y
     factor, slope = _radial(distortion, r2)
     u = x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (s1 + s2 * r2)
     v = y * factor + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + r2 * (s3 + s4 * r2)
+    if not derivatives:
+        return np.stack([u, v], axis=-1), np.empty(0)
     jacobian = np.empty((*np.shape(x), 2, 2))
     prism_u, prism_v = 2 * (s1 + 2 * s2 * r2), 2 * (s3 + 2 * s4 * r2)
     jacobian[..., 0, 0] = factor + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x + prism_u * x
@@ -248,7 +266,7 @@ def _fisheye_factor(k: Array, theta: Array) -> tuple[Array, Array]:
     return factor, slope
 
 
-def _fisheye_lens(p: Array, k: Array, widest: float, derivatives: bool) -> tuple[Array, Array, Array]:
+def _fisheye_lens(p: Array, k: Array, widest: float, derivatives: bool) -> tuple[Array, Array]:
     x, y, z = p[..., 0], p[..., 1], p[..., 2]
     r = np.hypot(x, y)
     theta = np.arctan2(r, z)
@@ -259,7 +277,7 @@ def _fisheye_lens(p: Array, k: Array, widest: float, derivatives: bool) -> tuple
     plane = p[..., :2] * scale[..., None]
     plane[~(theta <= widest)] = np.nan
     if not derivatives:
-        return plane, np.empty(0), np.empty(0)
+        return plane, np.empty(0)
     unit = np.where(near[..., None], 0.0, p[..., :2] / safe[..., None])
     square = r * r + z * z
     # radial direction grows with d theta_d/d theta * d theta/d r, tangential direction with theta_d / r
@@ -268,8 +286,14 @@ def _fisheye_lens(p: Array, k: Array, widest: float, derivatives: bool) -> tuple
     outer = unit[..., :, None] * unit[..., None, :]
     by_point[..., :2] = scale[..., None, None] * np.eye(2) + (radial - scale)[..., None, None] * outer
     by_point[..., 2] = -unit * (slope * r / square)[..., None]
-    powers = np.stack([theta**n for n in (3, 5, 7, 9)], axis=-1)
-    return plane, by_point, unit[..., :, None] * powers[..., None, :]
+    return plane, by_point
+
+
+def _fisheye_by_coefficient(p: Array) -> Array:
+    r = np.hypot(p[..., 0], p[..., 1])
+    unit = p[..., :2] / np.where(r > 0, r, 1.0)[..., None]
+    theta = np.arctan2(r, p[..., 2])
+    return unit[..., :, None] * np.stack([theta**n for n in (3, 5, 7, 9)], axis=-1)[..., None, :]
 
 
 def _fisheye_ray(plane: Array, k: Array, widest: float, tolerance: float) -> Array:

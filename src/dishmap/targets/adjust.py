@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.camera.model import Camera
-from dishmap.targets.edges import LocalMaps, Poses, local_maps
+from dishmap.targets.edges import LocalMaps, Patches, Poses, local_maps
 from dishmap.targets.pixels import BLUR, GEOMETRY, OFFSET_MM, OFFSET_PX, RingPixels, Rings, RingSums, State, Weighting, ring_sums, without_light
 from dishmap.transforms import rotation_from_vector
 
@@ -21,9 +21,10 @@ Array = NDArray[np.float64]
 # A step moves no edge by more than this, so that the linear model holds (edges are about a blur wide).
 LARGEST_STEP_PX = 1.5
 LARGEST_TURN_RAD = 0.2
+NEW_FIELDS_RAD = 0.01
 SHARPEST_BLUR_PX, WIDEST_BLUR_PX = 0.3, 12.0
-# Converged when a step is under 3 % of the estimate's own sigma, or under 2e-5 px where sigma is smaller still.
-STEP_SIGMAS, STEP_PX = 0.03, 2e-5
+# Converged when the next step would be under 6 % of the estimate's own sigma, or the step itself is under 2e-4 px.
+STEP_SIGMAS, STEP_PX, SETTLED_PX = 0.06, 2e-4, 0.1
 # A turn about the normal is unknown for targets of one centre; this prior merely keeps it at zero.
 NO_TURN_SIGMA_RAD = 1e-4
 
@@ -51,15 +52,12 @@ class Batch:
 
     camera: Camera
     curvature_per_mm: Array
-    reach_mm: float
     rings: Rings
     priors: Priors
-    anchor_px: Array
-    scale_px: Array
 
-    def maps(self, poses: Poses) -> LocalMaps:
-        """The local maps of the batch's targets at `poses`."""
-        return local_maps(self.camera, poses, self.curvature_per_mm, self.reach_mm, self.anchor_px, self.scale_px)
+    def maps(self, poses: Poses, patches: Patches, before: LocalMaps | None = None) -> LocalMaps:
+        """The local maps of patches of the batch's targets at `poses`; motion fields are taken from `before` if given."""
+        return local_maps(self.camera, poses, self.curvature_per_mm, patches, before)
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,6 @@ class Adjusted:
     sums: RingSums
     residual: NDArray[np.float32]
     noise_variance: Array
-    misfit_px: Array
 
 
 def by_target(values: Array, target: NDArray[np.int64], count: int) -> Array:
@@ -106,12 +103,12 @@ def prior_terms(poses: Poses, state: State, priors: Priors) -> tuple[Array, Arra
     return precision, precision * pull
 
 
-def adjust(batch: Batch, pixels: RingPixels, poses: Poses, state: State, weighting: Weighting, steps: int) -> Adjusted:
-    """Run up to `steps` Gauss-Newton steps from `poses` and `state`, until every target has converged."""
+def adjust(batch: Batch, pixels: RingPixels, poses: Poses, state: State, weighting: Weighting, steps: int, enough: float = 1.0) -> Adjusted:
+    """Run up to `steps` Gauss-Newton steps from `poses` and `state`, until a share `enough` of the targets has converged."""
     count = len(poses)
     converged = np.zeros(count, bool)
-    maps = batch.maps(poses)
-    for step in range(steps + 1):
+    maps = batch.maps(poses, pixels.patches)
+    for step in range(steps):
         sums, residual = ring_sums(pixels, batch.rings, maps, state, weighting)
         freedom = np.maximum(by_target(sums.weight, pixels.target, count) - GEOMETRY, 1.0)
         variance = np.maximum(by_target(sums.square, pixels.target, count) / freedom, 1e-12)
@@ -120,21 +117,23 @@ def adjust(batch: Batch, pixels: RingPixels, poses: Poses, state: State, weighti
         precision, pull = prior_terms(poses, state, batch.priors)
         information = data.copy()
         information[:, range(GEOMETRY), range(GEOMETRY)] += precision
-        if step == steps:
-            break
         delta = solve_scaled(information, by_target(right, pixels.target, count) / variance[:, None] + pull)
         sigmas = np.sqrt(np.maximum(np.einsum("tg,tgh,th->t", delta, information, delta) / GEOMETRY, 0))
-        move_px = _largest_motion_px(delta, maps, poses)
-        converged = (sigmas < STEP_SIGMAS) | (move_px < STEP_PX)
+        move_px = _largest_motion_px(delta, maps, pixels.target, count)
+        # after a Gauss-Newton step of size x the next is about x^2 / blur: what is left is judged, not what was done
+        left = np.minimum(move_px / (2 * state.blur_px), 1.0)
+        converged = (sigmas * left < STEP_SIGMAS) & (move_px < SETTLED_PX) | (move_px < STEP_PX)
         turn = np.linalg.norm(delta[:, 3:6], axis=1)
         limit = np.minimum(1.0, np.minimum(LARGEST_STEP_PX / np.maximum(move_px, 1e-9), LARGEST_TURN_RAD / np.maximum(turn, 1e-9)))
         poses, state = _moved(poses, state, delta * np.nan_to_num(limit)[:, None])
-        if converged.all():
+        if converged.mean() >= enough or step == steps - 1:
             # the last step was a small part of sigma: the sums before it serve as those after it
             break
-        maps = batch.maps(poses)
+        # the motion fields only steer: they are made anew when targets turn, not at every step
+        turning = float(np.nan_to_num(turn).max(initial=0.0)) > NEW_FIELDS_RAD
+        maps = batch.maps(poses, pixels.patches, None if turning else maps)
     good = converged & np.isfinite(poses.position_mm).all(axis=1)
-    return Adjusted(poses, state, information, data, good, sums, residual, variance, maps.misfit_px)
+    return Adjusted(poses, state, information, data, good, sums, residual, variance)
 
 
 def solve_scaled(matrix: Array, right: Array) -> Array:
@@ -159,12 +158,13 @@ def inverse_scaled(matrix: Array) -> Array:
     return out
 
 
-def _largest_motion_px(delta: Array, maps: LocalMaps, poses: Poses) -> Array:
+def _largest_motion_px(delta: Array, maps: LocalMaps, target: NDArray[np.int64], count: int) -> Array:
     """Rough bound on how far a step moves any printed point, px, plus how much it changes blur and offset."""
-    constant = np.einsum("tkg,tg->tk", maps.motion[:, 0], delta[:, :6])
-    linear = np.einsum("tlkg,tg->tlk", maps.motion[:, 1:3], delta[:, :6])
-    image = np.linalg.norm(constant, axis=1) + np.linalg.norm(linear, axis=(1, 2))
-    return np.asarray(image + np.abs(delta[:, OFFSET_PX]) + np.abs(delta[:, BLUR]))
+    fields = np.einsum("mkgl,mg->mkl", maps.motion[..., :3], delta[target, :6])
+    image = np.linalg.norm(fields[..., 0], axis=1) + np.linalg.norm(fields[..., 1:], axis=(1, 2))
+    out = np.zeros(count)
+    np.maximum.at(out, target, image)
+    return np.asarray(out + np.abs(delta[:, OFFSET_PX]) + np.abs(delta[:, BLUR]))
 
 
 def _moved(poses: Poses, state: State, delta: Array) -> tuple[Poses, State]:

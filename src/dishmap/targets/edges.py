@@ -13,47 +13,48 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.camera.model import Camera
+from dishmap.targets.pattern import bent_print_mm
 from dishmap.transforms import cross_matrix
 
 Array = NDArray[np.float64]
 
-# Degree of the pixel -> plane polynomial; at 5 a target 0.1 rad wide, tilted 60 degrees, leaves under 1e-4 px.
-PLANE_DEGREE = 5
+# Degrees of the pixel -> plane polynomial: the first is used unless it leaves more than MISFIT_PX anywhere on its nodes.
+PLANE_DEGREES = (3, 5)
+MISFIT_PX = 2e-4
 # Degree of the motion fields: they only steer the fit and give its Fisher information.
 MOTION_DEGREE = 2
-NODES_PER_SIDE = 8
 
 
 def _powers(degree: int) -> list[tuple[int, int]]:
     return [(total - j, j) for total in range(degree + 1) for j in range(total + 1)]
 
 
-POWERS = _powers(PLANE_DEGREE)
 MOTION_TERMS = len(_powers(MOTION_DEGREE))
 
 
-def _derivative_matrix(axis: int) -> Array:
-    """D with (D @ c) the coefficients of the derivative of the polynomial with coefficients c."""
-    out = np.zeros((len(POWERS), len(POWERS)))
-    for column, power in enumerate(POWERS):
+def _derivative_matrix(axis: int, degree: int) -> Array:
+    """D with (c @ D) the coefficients of the derivative of the polynomial with coefficients c."""
+    powers = _powers(degree)
+    out = np.zeros((len(powers), len(powers)))
+    for row, power in enumerate(powers):
         if power[axis]:
             lower = (power[0] - 1, power[1]) if axis == 0 else (power[0], power[1] - 1)
-            out[POWERS.index(lower), column] = power[axis]
+            out[row, powers.index(lower)] = power[axis]
     return out
 
 
-BY_U, BY_V = _derivative_matrix(0), _derivative_matrix(1)
+DERIVATIVES = {degree: (_derivative_matrix(0, degree), _derivative_matrix(1, degree)) for degree in PLANE_DEGREES}
 
 
-def monomials(s: NDArray[np.floating], t: NDArray[np.floating], degree: int = PLANE_DEGREE) -> NDArray[np.floating]:
-    """Monomials (..., K) of s, t up to `degree`, in the order of their total degree."""
-    out = np.empty((*s.shape, len(_powers(degree))), dtype=s.dtype)
-    out[..., 0] = 1
+def monomials(s: NDArray[np.floating], t: NDArray[np.floating], degree: int) -> NDArray[np.floating]:
+    """Monomials (..., K, n) of s, t (..., n) up to `degree`, in the order of their total degree."""
+    out = np.empty((*s.shape[:-1], len(_powers(degree)), s.shape[-1]), dtype=s.dtype)
+    out[..., 0, :] = 1
     start = 1
     for total in range(1, degree + 1):
         before = start - total
-        np.multiply(out[..., before : before + total], s[..., None], out=out[..., start : start + total])
-        np.multiply(out[..., start - 1], t, out=out[..., start + total])
+        np.multiply(out[..., before : before + total, :], s[..., None, :], out=out[..., start : start + total, :])
+        np.multiply(out[..., start - 1, :], t, out=out[..., start + total, :])
         start += total + 1
     return out
 
@@ -86,32 +87,33 @@ class Poses:
 
 
 @dataclass(frozen=True)
-class LocalMaps:
-    """Polynomials around each of T targets, in s = (u - anchor_u) / scale, t = (v - anchor_v) / scale.
+class Patches:
+    """Small areas of targets over which maps are fitted: target (M,) index, center_mm (M, 2), reach_mm (M,) in its plane,
+    anchor_px (M, 2) and scale_px (M,) of the pixel coordinates s = (u - anchor_u) / scale, t = (v - anchor_v) / scale."""
 
-    plane (T, K, 6): x, y in mm and their derivatives by u and v (mm/px), so that `monomials @ plane` gives all six;
-    motion (T, L, 2, 6): pixel motion (u, v) by the six pose parameters; anchor_px (T, 2); scale_px (T,);
-    misfit_px (T,): largest error of the plane polynomial at its nodes.
-    """
-
+    target: NDArray[np.int64]
+    center_mm: Array
+    reach_mm: Array
     anchor_px: Array
     scale_px: Array
+
+
+@dataclass(frozen=True)
+class LocalMaps:
+    """Polynomials over M patches in their coordinates s, t.
+
+    plane (M, 6, K): coefficients of x, y in mm and of dx/du, dx/dv, dy/du, dy/dv (mm/px), so `plane @ monomials` gives all six;
+    motion (M, 2, 6, L): of the pixel motion (u, v) under the six pose parameters; misfit_px (M,): largest error at the nodes.
+    """
+
     plane: Array
     motion: Array
     misfit_px: Array
+    degree: int
 
 
-def printed_points(xy_mm: Array, curvature_per_mm: Array) -> Array:
-    """Points (T, Q, 3) in target axes of printed positions (Q, 2) or (T, Q, 2) on surfaces with curvature (T, 2, 2).
-
-    A print keeps its lengths along the surface, so a position is followed along its geodesic, to third order:
-    v + (v K v) / 2 normal - (v K v) K v / 6 (do Carmo, Differential Geometry, 4.4). The last term is 0.5 micrometres
-    at 10 mm on a 0.6 m dish of f/D 0.5, which is 0.03 mm in depth.
-    """
-    xy = np.broadcast_to(xy_mm, (len(curvature_per_mm), *xy_mm.shape[-2:]))
-    bent = np.einsum("tij,tqj->tqi", curvature_per_mm, xy)
-    twice_sag = (xy * bent).sum(axis=-1, keepdims=True)
-    return np.concatenate([xy - twice_sag * bent / 6, 0.5 * twice_sag], axis=-1)
+def _in_camera(poses: Poses, local: Array) -> Array:
+    return poses.position_mm[:, None] + local @ np.swapaxes(poses.rotation, 1, 2)
 
 
 def project_printed(camera: Camera, poses: Poses, curvature_per_mm: Array, xy_mm: Array) -> tuple[Array, Array]:
@@ -119,40 +121,64 @@ def project_printed(camera: Camera, poses: Poses, curvature_per_mm: Array, xy_mm
 
     The parameters are three moves in mm along `poses.steps` and three turns in rad about the target's own axes.
     """
-    local = printed_points(xy_mm, curvature_per_mm)
-    points = poses.position_mm[:, None] + np.einsum("tij,tqj->tqi", poses.rotation, local)
-    pixels, by_point, _ = camera.project_with_jacobians(points)
+    local = bent_print_mm(xy_mm, curvature_per_mm)
+    pixels, by_point = camera.project_with_point_jacobian(_in_camera(poses, local))
     moves = by_point @ poses.steps[:, None]
     turns = by_point @ (poses.rotation[:, None] @ -cross_matrix(local))
     return pixels, np.concatenate([moves, turns], axis=-1)
 
 
-def local_maps(camera: Camera, poses: Poses, curvature_per_mm: Array, reach_mm: float, anchor_px: Array, scale_px: Array) -> LocalMaps:
-    """Fit the polynomial maps of T targets over printed positions within `reach_mm` of their origins."""
+def local_maps(camera: Camera, poses: Poses, curvature_per_mm: Array, patches: Patches, before: LocalMaps | None = None) -> LocalMaps:
+    """Fit the polynomial maps of M patches of T targets at their present poses; motion fields are taken from `before` if given."""
+    many, curvature = poses.take(patches.target), curvature_per_mm[patches.target]
+    maps = None
+    for degree in PLANE_DEGREES:
+        plane, misfit = _plane_maps(camera, many, curvature, patches, degree)
+        maps = (plane, misfit, degree)
+        if np.nanmax(np.where(np.isfinite(misfit), misfit, 0.0), initial=0.0) < MISFIT_PX:
+            break
+    assert maps is not None
+    motion = _motion_maps(camera, many, curvature, patches) if before is None else before.motion
+    return LocalMaps(maps[0], motion, maps[1], maps[2])
+
+
+def _nodes(patches: Patches, per_side: int) -> Array:
     # Chebyshev nodes keep the fit's error even up to the border
-    axis = reach_mm * np.cos(np.pi * (np.arange(NODES_PER_SIDE) + 0.5) / NODES_PER_SIDE)
-    nodes = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    pixels, motion = project_printed(camera, poses, curvature_per_mm, nodes)
-    st = (pixels - anchor_px[:, None]) / scale_px[:, None, None]
-    basis = monomials(st[..., 0], st[..., 1])
+    axis = np.cos(np.pi * (np.arange(per_side) + 0.5) / per_side)
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    return patches.center_mm[:, None] + patches.reach_mm[:, None, None] * grid
+
+
+def _basis(pixels: Array, patches: Patches, degree: int) -> Array:
+    st = (pixels - patches.anchor_px[:, None]) / patches.scale_px[:, None, None]
+    return monomials(st[..., 0], st[..., 1], degree)
+
+
+def _plane_maps(camera: Camera, poses: Poses, curvature: Array, patches: Patches, degree: int) -> tuple[Array, Array]:
+    nodes = _nodes(patches, degree + 2)
+    basis = _basis(camera.project(_in_camera(poses, bent_print_mm(nodes, curvature))), patches, degree)
     lost = ~np.isfinite(basis).all(axis=(1, 2))
     basis[lost] = 0.0
-    plane = _least_squares(basis, np.broadcast_to(nodes, (len(poses), *nodes.shape)))
-    few = basis[..., :MOTION_TERMS]
-    fields = _least_squares(few, np.nan_to_num(motion).reshape(len(poses), len(nodes), 12))
-    by_u, by_v = BY_U @ plane / scale_px[:, None, None], BY_V @ plane / scale_px[:, None, None]
-    error_mm = np.linalg.norm(basis @ plane - nodes, axis=-1).max(axis=1)
-    per_mm = scale_px / reach_mm
-    all_six = np.concatenate([plane, by_u, by_v], axis=-1)[..., [0, 1, 2, 4, 3, 5]]
-    misfit = np.where(lost, np.inf, error_mm * per_mm)
-    return LocalMaps(anchor_px, scale_px, all_six, fields.reshape(len(poses), MOTION_TERMS, 2, 6), misfit)
+    plane = _least_squares(basis, np.swapaxes(nodes, 1, 2))
+    error = np.linalg.norm(plane @ basis - np.swapaxes(nodes, 1, 2), axis=1).max(axis=1)
+    misfit = np.where(lost, np.inf, error * patches.scale_px / patches.reach_mm)
+    by_s, by_t = DERIVATIVES[degree]
+    by_u, by_v = plane @ by_s / patches.scale_px[:, None, None], plane @ by_t / patches.scale_px[:, None, None]
+    return np.stack([plane[:, 0], plane[:, 1], by_u[:, 0], by_v[:, 0], by_u[:, 1], by_v[:, 1]], axis=1), misfit
+
+
+def _motion_maps(camera: Camera, poses: Poses, curvature: Array, patches: Patches) -> Array:
+    pixels, motion = project_printed(camera, poses, curvature, _nodes(patches, MOTION_DEGREE + 1))
+    basis = np.nan_to_num(_basis(pixels, patches, MOTION_DEGREE))
+    values = np.nan_to_num(motion).reshape(len(poses), -1, 12)
+    return _least_squares(basis, np.swapaxes(values, 1, 2)).reshape(len(poses), 2, 6, MOTION_TERMS)
 
 
 def _least_squares(basis: Array, values: Array) -> Array:
-    """Batched least squares (T, Q, K), (T, Q, V) -> (T, K, V); the monomials' condition is mild on [-1, 1]."""
-    normal = np.swapaxes(basis, -1, -2) @ basis
-    normal += 1e-14 * np.eye(basis.shape[-1])
-    return np.linalg.solve(normal, np.swapaxes(basis, -1, -2) @ values)
+    """Batched least squares (M, K, Q), (M, V, Q) -> (M, V, K); the monomials' condition is mild on [-1, 1]."""
+    normal = basis @ np.swapaxes(basis, 1, 2)
+    normal += 1e-14 * np.eye(basis.shape[1])
+    return np.swapaxes(np.linalg.solve(normal, basis @ np.swapaxes(values, 1, 2)), 1, 2)
 
 
 def edge_distance(
@@ -160,27 +186,29 @@ def edge_distance(
 ) -> tuple[NDArray[np.floating], ...]:
     """Signed distance in pixels from points to one projected circle, positive inside.
 
-    six (..., 6): x, y, dx/du, dx/dv, dy/du, dy/dv at each point; center_mm (..., 2) and radius_mm broadcast to its shape
-    without the last axis. Returns distance_px, unit outward normal u and v, px of edge motion per mm of radius, and the
+    six (M, 6, n): x, y, dx/du, dx/dv, dy/du, dy/dv at each point; center_mm (M, 2) and radius_mm (M,) of each row's circle. Returns distance_px, unit outward normal u and v, px of edge motion per mm of radius, and the
     curvature of the projected circle at the foot point (1/px, positive for a convex inside).
 
-    Second order in the distance: along the outward normal n, rho(t) = rho + m t + (tau^2 / rho) t^2 / 2 with m = |grad rho|
-    and tau the sideways part of J n, solved for rho(t) = R. Level lines of rho are not parallel where the target is tilted;
-    the plain ratio (R - rho) / m would shift the edge by up to curvature * blur^2.
+    The distance is along the gradient n of rho = |x - center|, to where x + t J n meets the circle (J = d plane / d pixel):
+    exact for a locally affine map. Level lines of rho are not parallel where the target is tilted; the plain ratio
+    (R - rho) / |grad rho| would shift the edge by up to curvature * blur^2.
     """
-    dx, dy = six[..., 0] - center_mm[..., 0], six[..., 1] - center_mm[..., 1]
+    x, y, xu, xv, yu, yv = (six[:, k] for k in range(6))
+    radius = radius_mm[:, None]
+    dx, dy = x - center_mm[:, :1], y - center_mm[:, 1:]
     rho = np.sqrt(dx * dx + dy * dy)
     inverse = 1 / np.maximum(rho, 1e-6)
     ex, ey = dx * inverse, dy * inverse
-    gu = ex * six[..., 2] + ey * six[..., 4]
-    gv = ex * six[..., 3] + ey * six[..., 5]
+    gu, gv = ex * xu + ey * yu, ex * xv + ey * yv
     px_per_mm = 1 / np.sqrt(gu * gu + gv * gv)
     nu, nv = gu * px_per_mm, gv * px_per_mm
-    hu = ex * six[..., 4] - ey * six[..., 2]
-    hv = ex * six[..., 5] - ey * six[..., 3]
-    sideways = hu * nu + hv * nv
-    tangential = hv * nu - hu * nv
-    first = (radius_mm - rho) * px_per_mm
-    distance = first - 0.5 * sideways * sideways * inverse * px_per_mm * first * first
-    curvature = tangential * tangential * px_per_mm / radius_mm
-    return distance, nu, nv, px_per_mm, curvature
+    wx, wy = xu * nu + xv * nv, yu * nu + yv * nv
+    along = wx * dx + wy * dy
+    speed = wx * wx + wy * wy
+    root = along * along + speed * (radius * radius - rho * rho)
+    distance = (np.sqrt(np.maximum(root, 0)) - along) / speed
+    # |J t| for the tangent t, which has no radial part: det J / |grad rho|
+    tangential = (xu * yv - xv * yu) * px_per_mm
+    tangential *= tangential
+    tangential *= px_per_mm
+    return distance, nu, nv, px_per_mm, tangential / radius

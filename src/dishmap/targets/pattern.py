@@ -226,6 +226,18 @@ class Pattern:
         return _marks(self)
 
 
+def bent_print_mm(xy_mm: Array, curvature_per_mm: Array) -> Array:
+    """Points (..., Q, 3) in target axes of printed positions (..., Q, 2) on surfaces with curvature (..., 2, 2).
+
+    A print keeps its lengths along the surface, so a position is followed along its geodesic, to third order:
+    v + (v K v) / 2 normal - (v K v) K v / 6 (do Carmo, Differential Geometry, 4.4). The last term is 0.5 micrometres
+    at 10 mm on a 0.6 m dish of f/D 0.5; left out, it would shift depths by 0.04 mm.
+    """
+    bent = xy_mm @ curvature_per_mm
+    twice_sag = (xy_mm * bent).sum(axis=-1, keepdims=True)
+    return np.concatenate([xy_mm - twice_sag * bent / 6, 0.5 * twice_sag], axis=-1)
+
+
 @dataclass(frozen=True)
 class Marks:
     """Outermost circles of all targets, with their nested circles: the things a detector finds.
@@ -257,8 +269,7 @@ def _marks(pattern: Pattern) -> Marks:
     # two marks are of one type only if their sizes agree too
     keys = [(round(row[3], 6), row[4]) for row in rows]
     types = sorted(set(keys))
-    sag = 0.5 * np.einsum("mi,mij,mj->m", local, pattern.curvature_per_mm[target], local)
-    offset = np.concatenate([local, sag[:, None]], axis=1)
+    offset = bent_print_mm(local[:, None], pattern.curvature_per_mm[target])[:, 0]
     center = pattern.center_mm[target] + np.einsum("mij,mj->mi", pattern.axes[target], offset)
     return Marks(
         target=target,

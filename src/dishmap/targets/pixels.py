@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from dishmap.targets.edges import MOTION_TERMS, LocalMaps, edge_distance, monomials
+from dishmap.targets.edges import MOTION_TERMS, LocalMaps, Patches, edge_distance, monomials
 from dishmap.targets.pattern import TargetKind
 
 Array = NDArray[np.float64]
@@ -31,11 +31,12 @@ OFFSET_MM, OFFSET_PX, BLUR = 6, 7, 8
 # Light parameters of a ring: ground level and slopes, ink level and slopes (grey levels, and per local unit).
 LIGHT = 6
 # Half width of the band of pixels used, in blurs: beyond it the edge changes the pixel by under 0.2 % of the contrast.
-BAND_BLURS, BAND_EXTRA_PX = 3.0, 0.8
+BAND_BLURS, BAND_EXTRA_PX = 2.7, 0.6
 # Above this product of curvature and blur the series for curved edges leaves more than 0.001 px; see tests.
 LARGEST_CURVED = 0.22
 FINE_FACTOR, FINE_BLUR_PX = 3, 0.4
-RINGS_AT_ONCE = 48
+# Pixels handled at once, so that the working arrays stay in the processor's cache.
+PIXELS_AT_ONCE = 24000
 TINY = np.float32(1e-6)
 
 
@@ -70,29 +71,31 @@ def rings_of(kind: TargetKind, together: bool = False) -> Rings:
 class RingPixels:
     """Pixels of M rings of one batch, padded to n each.
 
-    target, ring (M,): which target of the batch and which ring of its kind; s, t (M, n): local coordinates of the pixels
-    (see LocalMaps); grey (M, n): the photograph; used (M, n): false for padding and pixels left out.
-    shape: (H, W) of each ring's full window if the pixels are a whole window (fine rings), else None.
+    ring (M,): which ring of its kind; patches: the area around each ring, with its target; s, t (M, n): coordinates of the
+    pixels in the patch; grey (M, n): the photograph; used (M, n): false for padding and pixels left out.
+    shape: (H, W) of each ring's full window if the pixels are a whole window (fine rings), else None: blocks of 2x2.
     """
 
-    target: NDArray[np.int64]
     ring: NDArray[np.int64]
+    patches: Patches
     s: Single
     t: Single
     grey: Single
     used: Bool
     shape: tuple[int, int] | None = None
 
+    @property
+    def target(self) -> NDArray[np.int64]:
+        """The target of each ring (M,)."""
+        return self.patches.target
+
     def every(self, step: int) -> RingPixels:
         """Keep every `step`-th pixel, for the first coarse steps of a fit (bands only)."""
         if step == 1 or self.shape is not None:
             return self
-        cut = np.s_[:, ::step]
-        return RingPixels(self.target, self.ring, self.s[cut], self.t[cut], self.grey[cut], self.used[cut])
-
-    def part(self, rows: slice) -> RingPixels:
-        """The rings `rows` alone."""
-        return RingPixels(self.target[rows], self.ring[rows], self.s[rows], self.t[rows], self.grey[rows], self.used[rows], self.shape)
+        cut = (slice(None), slice(None, None, step))
+        s, t, grey, used = (np.ascontiguousarray(values[cut]) for values in (self.s, self.t, self.grey, self.used))
+        return RingPixels(self.ring, self.patches, s, t, grey, used)
 
 
 @dataclass(frozen=True)
@@ -109,8 +112,8 @@ class RingSums:
     """What a pass over the pixels leaves of M rings.
 
     normal (M, G+L, G+L) and right (M, G+L): weighted normal equations, geometry first; light (M, L) the levels used;
-    square (M,): weighted sum of squared residuals; weight (M,): sum of weights; kept (M, C): share of each circle's edge
-    information that robust weighting left; count (M,): number of pixels.
+    square (M,): weighted sum of squared residuals; weight (M,): sum of robust weights; kept (M, C): share of each circle's
+    edge information that robust weighting left.
     """
 
     normal: Array
@@ -119,7 +122,6 @@ class RingSums:
     square: Array
     weight: Array
     kept: Array
-    count: Array
 
 
 @dataclass(frozen=True)
@@ -131,94 +133,119 @@ class Weighting:
     cut: Array | None
 
 
-def _coverage(six: Single, rings: Rings, ring: NDArray[np.int64], offset_mm: Single, offset_px: Single, blur: Single, motion: Single, mono: Single):
-    """Ink coverage (M, n), its derivative by the geometry (M, n, G) and each circle's edge weight (M, C, n)."""
-    cover = np.zeros(six.shape[:-1], np.float32)
-    pull_u, pull_v, by_mm, by_px, by_blur = (np.zeros_like(cover) for _ in range(5))
-    edges = np.empty((len(six), rings.radius_mm.shape[1], six.shape[1]), np.float32)
-    for c in range(rings.radius_mm.shape[1]):
-        sign = rings.sign[ring, c][:, None]
-        radius = (rings.radius_mm[ring, c] + rings.sign[ring, c] * offset_mm)[:, None]
-        d, nu, nv, px_per_mm, k = edge_distance(six, rings.center_mm[ring, c][:, None], radius)
+@dataclass(frozen=True)
+class _Look:
+    """What the coverage of some rings depends on, in single precision: local polynomials, circles, offsets and blur."""
+
+    plane: Single
+    motion: Single
+    degree: int
+    center_mm: Single
+    radius_mm: Single
+    sign: Single
+    offset_px: Single
+    blur_px: Single
+
+
+def _look(rows: slice, pixels: RingPixels, rings: Rings, maps: LocalMaps, state: State) -> _Look:
+    target, ring = pixels.target[rows], pixels.ring[rows]
+    single = [np.asarray(v[target], np.float32) for v in (state.offset_mm, state.offset_px, state.blur_px)]
+    sign = rings.sign[ring]
+    return _Look(
+        maps.plane[rows].astype(np.float32),
+        maps.motion[rows].astype(np.float32),
+        maps.degree,
+        rings.center_mm[ring],
         # ink spread moves dark edges out and light edges in
-        d += sign * offset_px[:, None]
-        b = blur[:, None]
-        ks = k * b
-        ks *= ks
-        s = b * (1 + 0.25 * ks)
-        d -= 0.5 * k * b * b * (1 + 0.75 * ks)
-        z = d / s
-        cover += sign * ndtr(z)
-        density = np.exp(-0.5 * z * z)
-        density *= np.float32(0.3989423) / s
-        edges[:, c] = np.abs(sign) * density
+        rings.radius_mm[ring] + sign * single[0][:, None],
+        sign,
+        single[1],
+        single[2],
+    )
+
+
+def _coverage(look: _Look, s: Single, t: Single, blur_px: Single) -> tuple[Single, Single, Single]:
+    """Ink coverage (M, n), its derivative by the geometry (M, G, n) and each circle's edge weight (M, C, n)."""
+    mono = monomials(s, t, look.degree)
+    six = look.plane @ mono
+    cover = np.zeros(s.shape, np.float32)
+    pull_u, pull_v = np.zeros_like(cover), np.zeros_like(cover)
+    out = np.zeros((len(s), GEOMETRY, s.shape[1]), np.float32)
+    edges = np.empty((len(s), look.radius_mm.shape[1], s.shape[1]), np.float32)
+    b = blur_px[:, None]
+    for c in range(look.radius_mm.shape[1]):
+        sign = look.sign[:, c, None]
+        d, nu, nv, px_per_mm, k = edge_distance(six, look.center_mm[:, c], look.radius_mm[:, c])
+        d += sign * look.offset_px[:, None]
+        kb = k * b
+        square = kb * kb
+        d -= (0.5 * b) * kb * (1 + np.float32(0.75) * square)
+        inverse = 1 / (b * (1 + np.float32(0.25) * square))
+        d *= inverse
+        cover += sign * ndtr(d)
+        density = np.exp(np.float32(-0.5) * d * d)
+        density *= inverse
+        density *= np.float32(0.3989423)
+        edges[:, c] = density * np.abs(sign)
+        out[:, OFFSET_PX] += edges[:, c]
+        out[:, OFFSET_MM] += edges[:, c] * px_per_mm
         density *= sign
         pull_u += density * nu
         pull_v += density * nv
-        density *= sign
-        by_px += density
-        by_mm += density * px_per_mm
-        density *= sign
-        by_blur -= density * (z + k * b)
-    return cover, _geometry(mono, motion, pull_u, pull_v, by_mm, by_px, by_blur), edges
+        d += kb
+        d *= density
+        out[:, BLUR] -= d
+    few = mono[:, :MOTION_TERMS]
+    np.matmul(look.motion[:, 0], few, out=out[:, :6])
+    out[:, :6] *= pull_u[:, None]
+    second = look.motion[:, 1] @ few
+    second *= pull_v[:, None]
+    out[:, :6] += second
+    return cover, out, edges
 
 
-def _geometry(mono: Single, motion: Single, pull_u: Single, pull_v: Single, by_mm: Single, by_px: Single, by_blur: Single) -> Single:
-    out = np.empty((*pull_u.shape, GEOMETRY), np.float32)
-    few = mono[..., :MOTION_TERMS]
-    np.matmul(few, motion[..., 0, :], out=out[..., :6])
-    out[..., :6] *= pull_u[..., None]
-    second = few @ motion[..., 1, :]
-    second *= pull_v[..., None]
-    out[..., :6] += second
-    out[..., OFFSET_MM], out[..., OFFSET_PX], out[..., BLUR] = by_mm, by_px, by_blur
-    return out
+def coverage_columns(rows: slice, pixels: RingPixels, rings: Rings, maps: LocalMaps, state: State) -> tuple[Single, Single, Single]:
+    """Ink coverage of rings `rows` (M, n), its derivative by the geometry (M, G, n), edge weights of circles (M, C, n).
 
-
-def coverage_columns(pixels: RingPixels, rings: Rings, maps: LocalMaps, state: State):
-    """Ink coverage of the pixels (M, n), its derivative by the geometry parameters (M, n, G), edge weights (M, C, n).
-
-    `maps` and `state` are those of the batch's targets; rows of `pixels` pick theirs by `pixels.target`.
+    `maps` are those of `pixels.patches`; `state` holds the batch's targets.
     """
-    which = pixels.target
-    plane, motion = maps.plane[which].astype(np.float32), maps.motion[which].astype(np.float32)
-    args = tuple(v[which].astype(np.float32) for v in (state.offset_mm, state.offset_px))
-    blur = state.blur_px[which].astype(np.float32)
+    look = _look(rows, pixels, rings, maps, state)
     if pixels.shape is None:
-        mono = monomials(pixels.s, pixels.t)
-        return _coverage(mono @ plane, rings, pixels.ring, *args, blur, motion, mono)
-    return _fine_columns(pixels, rings, maps, plane, motion, args, blur)
+        return _coverage(look, pixels.s[rows], pixels.t[rows], look.blur_px)
+    return _fine_columns(rows, pixels, look)
 
 
-def _fine_columns(pixels: RingPixels, rings: Rings, maps: LocalMaps, plane: Single, motion: Single, args: tuple[Single, Single], blur: Single):
+def _fine_columns(rows: slice, pixels: RingPixels, look: _Look) -> tuple[Single, Single, Single]:
     """As `_coverage`, but on a grid three times finer with a blur of 0.4 px, then blurred to the full width."""
     assert pixels.shape is not None
     height, width = pixels.shape
-    step = 1 / (FINE_FACTOR * maps.scale_px[pixels.target])
+    blur = look.blur_px
+    step = 1 / (FINE_FACTOR * pixels.patches.scale_px[rows])
     margin = FINE_FACTOR * int(np.ceil(4 * blur.max()))
     fine_h, fine_w = FINE_FACTOR * height + 2 * margin, FINE_FACTOR * width + 2 * margin
     # the middle one of each three fine samples sits on the pixel's centre
     first = margin + 1
     j, i = np.mgrid[:fine_h, :fine_w].reshape(2, -1)
-    s = (pixels.s[:, :1] + (i - first) * step[:, None]).astype(np.float32)
-    t = (pixels.t[:, :1] + (j - first) * step[:, None]).astype(np.float32)
-    mono = monomials(s, t)
-    start = np.full(len(blur), FINE_BLUR_PX, np.float32)
-    cover, columns, edges = _coverage(mono @ plane, rings, pixels.ring, *args, start, motion, mono)
+    s = (pixels.s[rows, :1] + (i - first) * step[:, None]).astype(np.float32)
+    t = (pixels.t[rows, :1] + (j - first) * step[:, None]).astype(np.float32)
+    # the window's corners lie beyond the patch, where its polynomials mean nothing; no edge is there
+    outside = s * s + t * t > 1
+    cover, columns, edges = _coverage(look, s * ~outside, t * ~outside, np.full(len(blur), FINE_BLUR_PX, np.float32))
+    cover[outside] = 0
+    columns *= ~outside[:, None]
+    edges *= ~outside[:, None]
     extra = np.sqrt(np.maximum(blur.astype(float) ** 2 - FINE_BLUR_PX**2, 1e-4))
-    rows, rows_by = _blur_matrix(height, fine_h, first, extra)
-    cols, cols_by = _blur_matrix(width, fine_w, first, extra)
+    down, down_by = _blur_matrix(height, fine_h, first, extra)
+    across, across_by = _blur_matrix(width, fine_w, first, extra)
 
     def blurred(values: Single, down: Single, across: Single) -> Single:
-        image = values.reshape(len(values), fine_h, fine_w, -1).transpose(0, 3, 1, 2)
-        out = down[:, None] @ image @ np.swapaxes(across, -1, -2)[:, None]
-        return out.transpose(0, 2, 3, 1).reshape(len(values), height * width, -1)
+        image = values.reshape(len(values), -1, fine_h, fine_w)
+        return (down[:, None] @ image @ np.swapaxes(across, 1, 2)[:, None]).reshape(len(values), -1, height * width)
 
-    out = blurred(columns, rows, cols)
-    by_extra = blurred(cover[..., None], rows_by, cols) + blurred(cover[..., None], rows, cols_by)
-    out[..., BLUR] = by_extra[..., 0] * (blur / extra)[:, None]
-    edge = blurred(edges.transpose(0, 2, 1), rows, cols).transpose(0, 2, 1)
-    return blurred(cover[..., None], rows, cols)[..., 0], out, edge
+    out = blurred(columns, down, across)
+    by_extra = blurred(cover, down_by, across) + blurred(cover, down, across_by)
+    out[:, BLUR] = by_extra[:, 0] * (blur / extra)[:, None]
+    return blurred(cover, down, across)[:, 0], out.astype(np.float32), blurred(edges, down, across)
 
 
 def _blur_matrix(size: int, fine: int, first: int, extra: Array) -> tuple[Single, Single]:
@@ -229,76 +256,87 @@ def _blur_matrix(size: int, fine: int, first: int, extra: Array) -> tuple[Single
     return kernel.astype(np.float32), (kernel * (z2 - 1) / extra[:, None, None]).astype(np.float32)
 
 
-def light_columns(pixels: RingPixels, cover: Single) -> Single:
-    """Derivative of the pixels by the ring's light levels (M, n, L): ground and ink, each level and two slopes."""
-    # slopes are about the ring's own middle, so that levels and slopes are nearly independent
-    s, t = (v - v.mean(axis=1, keepdims=True) for v in (pixels.s, pixels.t))
-    out = np.empty((*cover.shape, LIGHT), np.float32)
-    out[..., 0], out[..., 3] = 1 - cover, cover
+def light_columns(s: Single, t: Single, cover: Single) -> Single:
+    """Derivative of the pixels by the ring's light levels (M, L, n): ground and ink, each level and two slopes."""
+    out = np.empty((len(cover), LIGHT, cover.shape[1]), np.float32)
+    np.subtract(1, cover, out=out[:, 0])
+    out[:, 3] = cover
     for column, place in ((1, s), (2, t)):
-        np.multiply(out[..., 0], place, out=out[..., column])
-        np.multiply(out[..., 3], place, out=out[..., column + 3])
+        np.multiply(out[:, 0], place, out=out[:, column])
+        np.multiply(out[:, 3], place, out=out[:, column + 3])
     return out
 
 
-def solve_light(pixels: RingPixels, columns: Single, weight: Single) -> Array:
+def solve_light(columns: Single, grey: Single, weight: Single) -> Array:
     """Best light levels (M, L) of each ring for a given coverage; slopes lean weakly towards zero so that tiny rings hold."""
-    weighted = columns * weight[..., None]
-    normal = (np.swapaxes(weighted, 1, 2) @ columns).astype(float)
-    right = (np.swapaxes(weighted, 1, 2) @ pixels.grey[..., None])[..., 0].astype(float)
-    diagonal = np.maximum(np.trace(normal, axis1=1, axis2=2), 1e-9)[:, None]
-    normal[:, range(LIGHT), range(LIGHT)] += 1e-7 * diagonal
-    return np.linalg.solve(normal, right[..., None])[..., 0]
+    weighted = columns * weight[:, None]
+    normal = (weighted @ np.swapaxes(columns, 1, 2)).astype(float)
+    right = (weighted @ grey[..., None]).astype(float)
+    normal[:, range(LIGHT), range(LIGHT)] += _ridge(normal)
+    return np.linalg.solve(normal, right)[..., 0]
+
+
+def _ridge(normal: Array) -> Array:
+    return 1e-7 * np.maximum(np.trace(normal, axis1=1, axis2=2), 1e-9)[:, None]
 
 
 def ring_sums(pixels: RingPixels, rings: Rings, maps: LocalMaps, state: State, weighting: Weighting) -> tuple[RingSums, Single]:
     """One pass over the pixels: normal equations of every ring at the present state, and the residuals (M, n) in grey levels."""
     parts, residuals = [], []
-    for begin in range(0, len(pixels.ring), RINGS_AT_ONCE):
-        rows = slice(begin, begin + RINGS_AT_ONCE)
-        cut = None if weighting.cut is None else weighting.cut[rows]
-        sums, residual = _sums(pixels.part(rows), rings, maps, state, weighting, cut)
+    many = max(1, PIXELS_AT_ONCE // max(1, pixels.s.shape[1]))
+    for begin in range(0, len(pixels.ring), many):
+        rows = slice(begin, begin + many)
+        sums, residual = _sums(rows, pixels, rings, maps, state, weighting)
         parts.append(sums)
         residuals.append(residual)
     fields = RingSums.__dataclass_fields__
     return RingSums(*(np.concatenate([getattr(p, f) for p in parts]) for f in fields)), np.concatenate(residuals)
 
 
-def _sums(pixels: RingPixels, rings: Rings, maps: LocalMaps, state: State, weighting: Weighting, cut: Array | None) -> tuple[RingSums, Single]:
-    cover, geometry, edges = coverage_columns(pixels, rings, maps, state)
-    used = pixels.used.astype(np.float32)
-    columns = light_columns(pixels, cover)
-    light = solve_light(pixels, columns, used)
-    residual = pixels.grey - (columns @ light[..., None].astype(np.float32))[..., 0]
+def _sums(rows: slice, pixels: RingPixels, rings: Rings, maps: LocalMaps, state: State, weighting: Weighting) -> tuple[RingSums, Single]:
+    cover, geometry, edges = coverage_columns(rows, pixels, rings, maps, state)
+    used, grey = pixels.used[rows].astype(np.float32), pixels.grey[rows]
+    columns = light_columns(pixels.s[rows], pixels.t[rows], cover)
+    light, model = _levels(columns, grey, used)
     robust = used
-    if cut is not None:
-        for _ in range(2):
-            # the levels were found with the outliers in; once more without them
-            x = residual / cut[:, None].astype(np.float32)
-            robust = used * np.square(np.maximum(1 - x * x, 0))
-            light = solve_light(pixels, columns, robust)
-            residual = pixels.grey - (columns @ light[..., None].astype(np.float32))[..., 0]
-    model = pixels.grey - residual
+    if weighting.cut is not None:
+        cut = weighting.cut[rows, None].astype(np.float32)
+        robust = _bisquare(grey - model, cut, used)
+        # the levels were found with the outliers in; once more without them
+        light, model = _levels(columns, grey, robust)
+        robust = _bisquare(grey - model, cut, used)
+    residual = grey - model
     variance = np.maximum(np.float32(weighting.base) + np.float32(weighting.slope) * np.maximum(model, 0), TINY)
     weight = robust / variance
-    light32 = light.astype(np.float32)
-    contrast = (columns[..., :3] + columns[..., 3:]) @ (light32[:, 3:] - light32[:, :3])[..., None]
-    every = np.concatenate([geometry * contrast, columns], axis=-1)
-    weighted = np.swapaxes(every * weight[..., None], 1, 2)
-    normal = (weighted @ every).astype(float)
+    step = (light[:, None, 3:] - light[:, None, :3]).astype(np.float32)
+    geometry *= step @ (columns[:, :3] + columns[:, 3:])
+    every = np.concatenate([geometry, columns], axis=1)
+    weighted = every * weight[:, None]
+    normal = (weighted @ np.swapaxes(every, 1, 2)).astype(float)
     right = (weighted @ residual[..., None])[..., 0].astype(float)
-    edge_all = (edges * used[:, None]).sum(axis=2)
-    kept = (edges * robust[:, None]).sum(axis=2) / np.maximum(edge_all, TINY)
-    square = (weight * residual * residual).sum(axis=1, dtype=float)
-    return RingSums(normal, right, light, square, robust.sum(axis=1, dtype=float), kept.astype(float), used.sum(axis=1, dtype=float)), residual
+    kept = (edges @ robust[..., None])[..., 0] / np.maximum((edges @ used[..., None])[..., 0], TINY)
+    square = np.einsum("mn,mn,mn->m", weight, residual, residual).astype(float)
+    # circles of unused places and rings without pixels count as whole
+    kept[(edges @ used[..., None])[..., 0] <= TINY] = 1.0
+    return RingSums(normal, right, light, square, robust.sum(axis=1, dtype=float), kept.astype(float)), residual
+
+
+def _levels(columns: Single, grey: Single, weight: Single) -> tuple[Array, Single]:
+    light = solve_light(columns, grey, weight)
+    return light, (light[:, None].astype(np.float32) @ columns)[:, 0]
+
+
+def _bisquare(residual: Single, cut: Single, used: Single) -> Single:
+    """Weights that are 1 up to half the cut and fall to 0 at the cut, so that Gaussian noise loses nothing."""
+    x = residual / cut
+    return np.square(np.clip((1 - x * x) * np.float32(4 / 3), 0, 1)) * used
 
 
 def without_light(sums: RingSums) -> tuple[Array, Array]:
     """Normal equations of the geometry alone (M, G, G), (M, G), with each ring's own light levels eliminated (Schur)."""
     g = slice(0, GEOMETRY)
     cross, own = sums.normal[:, g, GEOMETRY:], sums.normal[:, GEOMETRY:, GEOMETRY:].copy()
-    diagonal = np.maximum(np.trace(own, axis1=1, axis2=2), 1e-9)[:, None]
-    own[:, range(LIGHT), range(LIGHT)] += 1e-7 * diagonal
+    own[:, range(LIGHT), range(LIGHT)] += _ridge(own)
     solved = np.linalg.solve(own, np.concatenate([np.swapaxes(cross, 1, 2), sums.right[:, GEOMETRY:, None]], axis=2))
     normal = sums.normal[:, g, g] - cross @ solved[..., :GEOMETRY]
     right = sums.right[:, g] - (cross @ solved[..., GEOMETRY:])[..., 0]

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.targets.adjust import Batch, solve_scaled
-from dishmap.targets.edges import Poses, printed_points, project_printed
-from dishmap.targets.pattern import TargetKind
+from dishmap.targets.edges import Poses, project_printed
+from dishmap.targets.pattern import TargetKind, bent_print_mm
 from dishmap.targets.window import OUTLINE_POINTS
 from dishmap.transforms import rotation_from_vector
 
@@ -39,7 +39,7 @@ def calibration_jacobian(batch: Batch, kind: TargetKind, poses: Poses, edge_info
     """
     xy, _ = _outline_samples(kind)
     pixels, motion = project_printed(batch.camera, poses, batch.curvature_per_mm, xy)
-    local = printed_points(xy, batch.curvature_per_mm)
+    local = bent_print_mm(xy, batch.curvature_per_mm)
     points = poses.position_mm[:, None] + np.einsum("tij,tqj->tqi", poses.rotation, local)
     _, _, by_camera = batch.camera.project_with_jacobians(points)
     normals, length = _edge_normals(pixels, kind)

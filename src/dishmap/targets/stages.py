@@ -13,11 +13,11 @@ from dishmap.targets.detect import Detections
 from dishmap.targets.edges import Poses
 from dishmap.targets.identify import Identity
 from dishmap.targets.pattern import Pattern, TargetKind
-from dishmap.targets.pixels import BAND_BLURS, BAND_EXTRA_PX, RingPixels, State, Weighting, rings_of
+from dishmap.targets.pixels import RingPixels, State, Weighting, rings_of
 from dishmap.targets.scene_noise import ROBUST_TO_SIGMA, NoiseModel, noise_model
 from dishmap.targets.start import EllipsePoints, centers_of, ellipse_points, fit_ellipses, nominal_poses, pair_circles, rigid_pose
-from dishmap.targets.window import outline, ring_layout, ring_pixels
-from dishmap.transforms import Pose
+from dishmap.targets.window import outline, patches_around, ring_areas, ring_layout, ring_pixels
+from dishmap.transforms import Pose, angle_between_rad
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -28,14 +28,15 @@ FIRST_BLUR_PX, FIRST_LOG_BLUR_SIGMA = 0.9, 1.0
 FIRST_BAND_BLUR_PX = 1.5
 FIRST_NORMAL_SIGMA_RAD = np.radians(12.0)
 COARSE_STRIDE = 4
-COARSE_STEPS, FULL_STEPS = 6, 8
+FIRST_STEPS, COARSE_STEPS, FULL_STEPS = 3, 8, 8
+COARSE_ENOUGH = 0.9
 # Targets in one group: bounds memory, and keeps the windows of a group about equally large.
 GROUP_SIZE = 64
 # Residuals beyond this many sigma and this share of the contrast are not noise but glare, dirt or something in front.
-CUT_SIGMAS, CUT_CONTRAST = 6.0, 0.1
+CUT_SIGMAS, CUT_CONTRAST = 8.0, 0.1
 # A ring of which less than this share of an edge survives is left out, when the target has others.
 LEAST_KEPT = 0.7
-# A normal farther than this from the surface (in sigmas of prior and data together) is left to the data alone.
+# A normal that the pixels pull farther than this from the surface, in sigmas of the prior, is left to the pixels.
 STRAY_SIGMAS = 4.0
 LEAST_NORMAL_SIGMA_RAD = np.radians(0.02)
 
@@ -113,13 +114,12 @@ def start_groups(
 
 
 def regroup(group: Group, keep: Bool) -> Group:
-    """The targets `keep` of a group, with local maps about their present places."""
+    """The targets `keep` of a group."""
     priors = group.batch.priors
     priors = replace(priors, normal=priors.normal[keep], normal_sigma_rad=priors.normal_sigma_rad[keep])
     batch = replace(group.batch, priors=priors, curvature_per_mm=group.batch.curvature_per_mm[keep])
     state = State(*(v[keep] for v in (group.state.offset_mm, group.state.offset_px, group.state.blur_px)))
-    poses = group.poses.take(keep)
-    return Group(group.kind, group.index[keep], poses, _placed(batch, group.kind, poses), state)
+    return Group(group.kind, group.index[keep], group.poses.take(keep), batch, state)
 
 
 def _first_group(camera: Camera, pattern: Pattern, kind: TargetKind, index: Index, poses: Poses, assumptions: Assumptions) -> Group:
@@ -133,21 +133,9 @@ def _first_group(camera: Camera, pattern: Pattern, kind: TargetKind, index: Inde
         log_blur_sigma=FIRST_LOG_BLUR_SIGMA,
         turns_freely=kind.turns_freely,
     )
-    batch = Batch(camera, pattern.curvature_per_mm[index], kind.extent_mm, rings_of(kind), priors, np.zeros((count, 2)), np.ones(count))
+    batch = Batch(camera, pattern.curvature_per_mm[index], rings_of(kind), priors)
     zero = np.zeros(count)
-    return Group(kind, index, poses, _placed(batch, kind, poses), State(zero, zero, np.full(count, FIRST_BLUR_PX)))
-
-
-def _placed(batch: Batch, kind: TargetKind, poses: Poses, blur_px: float = FIRST_BAND_BLUR_PX) -> Batch:
-    """The batch with local maps anchored at the present poses, reaching over ink and band."""
-    ends = outline(batch.camera, poses, batch.curvature_per_mm, np.zeros((1, 2)), np.array([kind.extent_mm]))[:, 0]
-    center, _ = centers_of(batch.camera, poses, batch.curvature_per_mm)
-    half = np.linalg.norm(ends - center[:, None], axis=2)
-    band = BAND_BLURS * blur_px + BAND_EXTRA_PX + 2.0
-    narrow = np.nan_to_num(half.min(axis=1), nan=np.inf)
-    reach = kind.extent_mm * (1 + band / max(float(narrow.min()), 1.0))
-    scale = np.nan_to_num(half.max(axis=1), nan=1.0) * reach / kind.extent_mm
-    return replace(batch, reach_mm=reach, anchor_px=np.round(np.nan_to_num(center)), scale_px=np.maximum(scale, 1.0))
+    return Group(kind, index, poses, batch, State(zero, zero, np.full(count, FIRST_BLUR_PX)))
 
 
 def _on_ellipses(group: Group, pattern: Pattern, detections: Detections, identity: Identity) -> Group:
@@ -162,9 +150,9 @@ def _on_ellipses(group: Group, pattern: Pattern, detections: Detections, identit
     target = place[marks.target[mark]][rows[:, 0]]
     # the nominal pose can be many pixels off on a bent surface: bring each target over its ellipses first
     poses = _shifted(group, points, target, rows[:, 1])
-    batch = _placed(group.batch, group.kind, poses)
-    poses = fit_ellipses(batch, group.kind, poses, EllipsePoints(points, target, rows[:, 1]))
-    return replace(group, poses=poses, batch=_placed(batch, group.kind, poses))
+    whole = np.zeros((1, 2)), np.array([group.kind.extent_mm])
+    patches = patches_around(group.batch.camera, poses, group.batch.curvature_per_mm, whole, FIRST_BAND_BLUR_PX)
+    return replace(group, poses=fit_ellipses(group.batch, group.kind, poses, patches, EllipsePoints(points, target, rows[:, 1])))
 
 
 def _shifted(group: Group, points: Array, target: Index, circle: Index) -> Poses:
@@ -182,21 +170,25 @@ def _shifted(group: Group, points: Array, target: Index, circle: Index) -> Poses
 
 def layout(image: NDArray[np.generic], group: Group, blur_px: float, band_blur_px: float) -> tuple[Batch, RingPixels]:
     """Rings and pixels of a group for a given blur, in a band wide enough for `band_blur_px`."""
-    batch = _placed(group.batch, group.kind, group.poses, band_blur_px)
     outlines = group.outlines()
-    across = np.linalg.norm(outlines - outlines.mean(axis=2, keepdims=True), axis=3).min(axis=2)
+    middle = outlines.mean(axis=2, keepdims=True)
+    across = np.linalg.norm(outlines - middle, axis=3).min(axis=2)
     rings, members, fine = ring_layout(group.kind, outlines, across / group.kind.radius_mm, blur_px)
-    batch = replace(batch, rings=rings)
-    return batch, ring_pixels(image, rings, batch.maps(group.poses), outlines, members, band_blur_px, fine)
+    batch = replace(group.batch, rings=rings)
+    areas = ring_areas(group.kind, members)
+    patches = patches_around(batch.camera, group.poses, batch.curvature_per_mm, areas, band_blur_px)
+    ends = outline(batch.camera, group.poses, batch.curvature_per_mm, *areas).reshape(len(patches.target), -1, 2)
+    half = np.nan_to_num(np.abs(ends - patches.anchor_px[:, None]).max(axis=(1, 2)), nan=1.0)
+    return batch, ring_pixels(image, rings, batch.maps(group.poses, patches), patches, half, band_blur_px, fine)
 
 
 def coarse_fit(image: NDArray[np.generic], group: Group) -> Coarse:
     """Fit every fourth pixel of a wide band, first all of them, then without outliers."""
     batch, pixels = layout(image, group, FIRST_BLUR_PX, FIRST_BAND_BLUR_PX)
     pixels = pixels.every(COARSE_STRIDE)
-    first = adjust(batch, pixels, group.poses, group.state, Weighting(1.0, 0.0, None), COARSE_STEPS)
+    first = adjust(batch, pixels, group.poses, group.state, Weighting(1.0, 0.0, None), FIRST_STEPS)
     cut = residual_cut(first, pixels)
-    second = adjust(batch, pixels, first.poses, first.state, Weighting(1.0, 0.0, cut), COARSE_STEPS)
+    second = adjust(batch, pixels, first.poses, first.state, Weighting(1.0, 0.0, cut), COARSE_STEPS, COARSE_ENOUGH)
     return Coarse(replace(group, poses=second.poses, state=second.state, batch=batch), second, pixels, residual_cut(second, pixels))
 
 
@@ -226,7 +218,8 @@ def learn(camera: Camera, pattern: Pattern, start: Pose, coarse: list[Coarse], a
     if assumptions.normal_sigma_deg is not None:
         return Shared(pose, noise, max(np.radians(assumptions.normal_sigma_deg), LEAST_NORMAL_SIGMA_RAD))
     tilt, covariance = zip(*(free_tilt(c, pose.rotation @ pattern.normal[c.group.index].T) for c in coarse), strict=True)
-    return Shared(pose, noise, normal_spread(np.concatenate(tilt), np.concatenate(covariance)))
+    settled = np.concatenate([c.adjusted.converged for c in coarse])
+    return Shared(pose, noise, normal_spread(np.concatenate(tilt)[settled], np.concatenate(covariance)[settled]))
 
 
 def free_tilt(coarse: Coarse, expected: Array) -> tuple[Array, Array]:
@@ -268,19 +261,20 @@ def full_fit(image: NDArray[np.generic], pattern: Pattern, coarse: Coarse, share
     """Fit all pixels of the band, with the photograph's noise and the surface's normals."""
     group = coarse.group
     expected = shared.camera_from_dish.rotate(pattern.normal[group.index])
-    tilt, covariance = free_tilt(coarse, expected.T)
-    width = covariance + shared.normal_sigma_rad**2 * np.eye(2)
-    stray = np.einsum("ti,tij,tj->t", tilt, np.linalg.inv(width), tilt) > STRAY_SIGMAS**2
-    sigma = np.where(stray, FIRST_NORMAL_SIGMA_RAD, shared.normal_sigma_rad)
     blur = float(np.median(group.state.blur_px))
-    priors = replace(group.batch.priors, normal=expected, normal_sigma_rad=sigma, blur_px=blur)
+    priors = replace(group.batch.priors, normal=expected, normal_sigma_rad=np.full(len(expected), shared.normal_sigma_rad), blur_px=blur)
     group = replace(group, batch=replace(group.batch, priors=priors))
     widest = float(np.quantile(group.state.blur_px, 0.9))
     batch, pixels = layout(image, group, widest, widest)
-    group = replace(group, batch=batch)
     cut, pixels = _without_bad_rings(coarse, pixels)
-    adjusted = adjust(batch, pixels, group.poses, group.state, Weighting(shared.noise.base, shared.noise.slope, cut), FULL_STEPS)
-    return replace(group, poses=adjusted.poses, state=adjusted.state), adjusted, pixels
+    weighting = Weighting(shared.noise.base, shared.noise.slope, cut)
+    adjusted = adjust(batch, pixels, group.poses, group.state, weighting, FULL_STEPS)
+    strays = angle_between_rad(adjusted.poses.rotation[..., 2], expected) > STRAY_SIGMAS * shared.normal_sigma_rad
+    if strays.any():
+        sigma = np.where(strays, FIRST_NORMAL_SIGMA_RAD, shared.normal_sigma_rad)
+        batch = replace(batch, priors=replace(priors, normal_sigma_rad=sigma))
+        adjusted = adjust(batch, pixels, adjusted.poses, adjusted.state, weighting, FULL_STEPS)
+    return replace(group, batch=batch, poses=adjusted.poses, state=adjusted.state), adjusted, pixels
 
 
 def _without_bad_rings(coarse: Coarse, pixels: RingPixels) -> tuple[Array, RingPixels]:

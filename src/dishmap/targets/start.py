@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dishmap.camera.model import Camera
 from dishmap.targets.adjust import Batch, by_target, prior_terms, solve_scaled
-from dishmap.targets.edges import Poses, edge_distance, monomials, project_printed
+from dishmap.targets.edges import MOTION_TERMS, Patches, Poses, edge_distance, monomials, project_printed
 from dishmap.targets.pattern import Pattern, TargetKind
 from dishmap.targets.pixels import GEOMETRY, OFFSET_PX, State
 from dishmap.transforms import Pose, cross_matrix, rotation_from_vector
@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 ELLIPSE_POINTS = 12
-# What a detected ellipse is good for before the pixels are fitted.
-ELLIPSE_SIGMA_PX = 0.2
+# What a detected ellipse is good for, shared over its points: its errors are common to all of them.
+ELLIPSE_SIGMA_PX = 0.25 * ELLIPSE_POINTS**0.5
 ELLIPSE_CUT_PX = 2.5
 ELLIPSE_STEPS = 5
 RIGID_STEPS = 10
@@ -73,25 +73,27 @@ def pair_circles(kind: TargetKind, outer_circle: Index, detection: Index, parent
     return rows
 
 
-def fit_ellipses(batch: Batch, kind: TargetKind, poses: Poses, points: EllipsePoints) -> Poses:
-    """Improve poses so that detected ellipses lie on the projected circles (Gauss-Newton, a few steps)."""
+def fit_ellipses(batch: Batch, kind: TargetKind, poses: Poses, patches: Patches, points: EllipsePoints) -> Poses:
+    """Improve poses so that detected ellipses lie on the projected circles (Gauss-Newton, a few steps).
+
+    `patches` holds one patch around each whole target.
+    """
     count = len(poses)
     sign = np.where(kind.dark[points.circle], 1.0, -1.0)[:, None]
-    st = (points.pixels - batch.anchor_px[points.target][:, None]) / batch.scale_px[points.target][:, None, None]
-    basis = monomials(st[..., 0], st[..., 1])
+    st = (points.pixels - patches.anchor_px[points.target][:, None]) / patches.scale_px[points.target][:, None, None]
     state = State(np.zeros(count), np.zeros(count), np.full(count, batch.priors.blur_px))
-    center, radius = kind.center_mm[points.circle][:, None], kind.radius_mm[points.circle][:, None]
+    center, radius = kind.center_mm[points.circle], kind.radius_mm[points.circle]
     for _ in range(ELLIPSE_STEPS):
-        maps = batch.maps(poses)
-        distance, nu, nv, *_ = edge_distance(basis @ maps.plane[points.target], center, radius)
-        few = basis[..., : maps.motion.shape[1]]
-        motion = maps.motion[points.target]
-        columns = np.zeros((*distance.shape, GEOMETRY))
-        columns[..., :6] = nu[..., None] * (few @ motion[..., 0, :]) + nv[..., None] * (few @ motion[..., 1, :])
-        columns[..., OFFSET_PX] = sign
+        maps = batch.maps(poses, patches)
+        basis = monomials(st[..., 0], st[..., 1], maps.degree)
+        distance, nu, nv, *_ = edge_distance(maps.plane[points.target] @ basis, center, radius)
+        motion = maps.motion[points.target] @ basis[:, None, :MOTION_TERMS]
+        columns = np.zeros((len(distance), GEOMETRY, distance.shape[1]))
+        columns[:, :6] = nu[:, None] * motion[:, 0] + nv[:, None] * motion[:, 1]
+        columns[:, OFFSET_PX] = sign
         weight = np.maximum(1 - (distance / ELLIPSE_CUT_PX) ** 2, 0.05) / ELLIPSE_SIGMA_PX**2
-        weighted = np.swapaxes(columns * weight[..., None], 1, 2)
-        normal = by_target(weighted @ columns, points.target, count)
+        weighted = columns * weight[:, None]
+        normal = by_target(weighted @ np.swapaxes(columns, 1, 2), points.target, count)
         right = -by_target((weighted @ distance[..., None])[..., 0], points.target, count)
         precision, pull = prior_terms(poses, state, batch.priors)
         normal[:, range(GEOMETRY), range(GEOMETRY)] += precision

@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.camera.model import Camera
-from dishmap.targets.edges import LocalMaps, Poses, monomials, project_printed
+from dishmap.targets.edges import LocalMaps, Patches, Poses, monomials, project_printed
 from dishmap.targets.pattern import TargetKind
 from dishmap.targets.pixels import BAND_BLURS, BAND_EXTRA_PX, LARGEST_CURVED, RingPixels, Rings, rings_of
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 OUTLINE_POINTS = 16
 # The blur of one ring must not reach the next: this many blurs of ground between them, else they are modelled together.
@@ -44,82 +45,99 @@ def ring_layout(kind: TargetKind, outlines: Array, scale_px_per_mm: Array, blur_
     return rings_of(kind, together), [outer] if together else [[i] for i in outer], fine
 
 
-def ring_pixels(
-    image: NDArray[np.generic], rings: Rings, maps: LocalMaps, outlines: Array, members: list[list[int]], blur_px: float, fine: bool
-) -> RingPixels:
-    """Pixels of every ring of T targets: the band along its edges, or its whole window for fine rings.
+def patches_around(camera: Camera, poses: Poses, curvature_per_mm: Array, areas: tuple[Array, Array], blur_px: float) -> Patches:
+    """Patches that hold areas (R, 2) centres and (R,) radii in mm of each of T targets, and the band around them.
 
-    outlines (T, C, Q, 2) of the kind's circles; members: for each ring the outermost circles (into C) in it.
+    Their order is target by target; anchors are whole pixels.
+    """
+    center, radius = areas
+    count = len(poses)
+    ends = outline(camera, poses, curvature_per_mm, center, radius)
+    middle = np.nan_to_num(ends.mean(axis=2)).reshape(-1, 2)
+    half = np.linalg.norm(ends - ends.mean(axis=2, keepdims=True), axis=3)
+    band = BAND_BLURS * blur_px + BAND_EXTRA_PX + 2.0
+    narrow = np.maximum(np.nan_to_num(half.min(axis=2), nan=1.0).reshape(-1), 0.5)
+    wide = np.nan_to_num(half.max(axis=2), nan=1.0).reshape(-1)
+    grow = 1 + band / narrow
+    return Patches(
+        target=np.repeat(np.arange(count), len(radius)),
+        center_mm=np.tile(center, (count, 1)),
+        reach_mm=np.tile(radius, count) * grow,
+        anchor_px=np.round(middle),
+        scale_px=np.maximum(wide * grow, 1.0),
+    )
+
+
+def ring_areas(kind: TargetKind, members: list[list[int]]) -> tuple[Array, Array]:
+    """Centre (R, 2) and radius (R,) in mm of a circle about each ring: its outermost circle, or the whole target."""
+    centers = np.array([kind.center_mm[group].mean(axis=0) for group in members])
+    reach = [(np.linalg.norm(kind.center_mm[g] - c, axis=1) + kind.radius_mm[g]).max() for g, c in zip(members, centers, strict=True)]
+    return centers, np.array(reach)
+
+
+def ring_pixels(image: NDArray[np.generic], rings: Rings, maps: LocalMaps, patches: Patches, half_px: Array, blur_px: float, fine: bool) -> RingPixels:
+    """Pixels of the rings of T targets: the band along their edges, or their whole window for fine rings.
+
+    half_px (M,): half the size of the ring's outline; `maps` are those of `patches`, one for each ring.
     """
     reach = BAND_BLURS * blur_px + BAND_EXTRA_PX
-    points = [outlines[:, group].reshape(len(outlines), -1, 2) for group in members]
-    low = np.stack([p.min(axis=1) for p in points], axis=1).reshape(-1, 2)
-    high = np.stack([p.max(axis=1) for p in points], axis=1).reshape(-1, 2)
-    target = np.repeat(np.arange(len(outlines)), len(points))
-    ring = np.tile(np.arange(len(points)), len(outlines))
-    middle = np.round(0.5 * (low + high))
-    half = np.ceil((0.5 * (high - low)).max(axis=1) + reach + 1)
+    ring = np.tile(np.arange(len(rings)), len(patches.target) // len(rings))
+    half = np.ceil(half_px + reach + 1)
     if fine:
-        return _whole_windows(image, maps, target, ring, middle, int(half.max()))
-    return _bands(image, rings, maps, target, ring, middle, half, reach)
+        return _whole_windows(image, rings, maps, patches, ring, int(half.max()), reach)
+    return _bands(image, rings, maps, patches, ring, half, reach)
 
 
-def _gather(image: NDArray[np.generic], u: NDArray[np.int64], v: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _gather(image: NDArray[np.generic], u: Index, v: Index) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     height, width = image.shape
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     flat = np.clip(v, 0, height - 1) * width + np.clip(u, 0, width - 1)
-    return image.reshape(-1)[flat].astype(np.float32), inside
+    return np.take(image.reshape(-1), flat).astype(np.float32), inside
 
 
-def _whole_windows(image, maps: LocalMaps, target, ring, middle: Array, half: int) -> RingPixels:
+def _whole_windows(image: NDArray[np.generic], rings: Rings, maps: LocalMaps, patches: Patches, ring: Index, half: int, reach: float) -> RingPixels:
     side = 2 * half + 1
-    j, i = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1)
-    u, v = middle[:, :1].astype(int) + i, middle[:, 1:].astype(int) + j
-    grey, inside = _gather(image, u, v)
-    anchor, scale = maps.anchor_px[target], maps.scale_px[target]
-    s = ((u - anchor[:, :1]) / scale[:, None]).astype(np.float32)
-    t = ((v - anchor[:, 1:]) / scale[:, None]).astype(np.float32)
-    return RingPixels(target, ring, s, t, grey, inside, (side, side))
+    dv, du = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1)
+    anchor = patches.anchor_px.astype(int)
+    grey, inside = _gather(image, anchor[:, :1] + du, anchor[:, 1:] + dv)
+    scale = patches.scale_px[:, None]
+    s, t = (du / scale).astype(np.float32), (dv / scale).astype(np.float32)
+    # a window may reach into the next target: only pixels near this one's edges count
+    return RingPixels(ring, patches, s, t, grey, inside & _near_edges(rings, maps, ring, s, t, reach), (side, side))
 
 
-def _bands(image, rings: Rings, maps: LocalMaps, target, ring, middle: Array, half: Array, reach: float) -> RingPixels:
-    """Pixels within `reach` of any edge, chosen by 2x2 blocks, every k-th of them for very large rings."""
+def _bands(image: NDArray[np.generic], rings: Rings, maps: LocalMaps, patches: Patches, ring: Index, half: Array, reach: float) -> RingPixels:
+    """Pixels within `reach` of any edge, chosen by 2x2 blocks; every k-th row and column for very large rings."""
     stride = int(np.ceil(2 * half.max() / LARGEST_WINDOW_PX))
-    side = int(np.ceil(half.max() / stride)) * 2
-    offsets = stride * np.arange(-(side // 2), side // 2 + 1, 2)
-    j, i = np.meshgrid(offsets, offsets, indexing="ij")
-    # the middle of each block of two by two (strided) pixels
-    s, t = _local(maps, target, middle[:, :1] + i.ravel() + 0.5 * stride, middle[:, 1:] + j.ravel() + 0.5 * stride)
-    six = monomials(s, t, 2) @ _plane_to_second_order(maps)[target].astype(np.float32)
-    near = np.zeros(s.shape, bool)
-    for c in range(rings.radius_mm.shape[1]):
-        dx, dy = six[..., 0] - rings.center_mm[ring, c, :1], six[..., 1] - rings.center_mm[ring, c, 1:]
-        rho = np.sqrt(dx * dx + dy * dy) + np.float32(1e-9)
-        gu, gv = dx * six[..., 2] + dy * six[..., 4], dx * six[..., 3] + dy * six[..., 5]
-        near |= (np.abs(rings.radius_mm[ring, c][:, None] - rho) * rho < (reach + 0.5 * stride) * np.sqrt(gu * gu + gv * gv)) & (
-            rings.sign[ring, c] != 0
-        )[:, None]
+    size = int(np.ceil(half.max() / stride / 2)) * 2
+    offsets = (stride * np.arange(-size, size + 1, 2)).astype(np.float32)
+    dv, du = (x.ravel() for x in np.meshgrid(offsets, offsets, indexing="ij"))
+    scale = patches.scale_px[:, None].astype(np.float32)
+    near = _near_edges(rings, maps, ring, (du + np.float32(0.5 * stride)) / scale, (dv + np.float32(0.5 * stride)) / scale, reach)
     row, block = np.nonzero(near)
     counts = near.sum(axis=1)
-    place = np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
-    u = np.zeros((len(near), max(int(counts.max()), 1) * 4), np.int64)
-    v, used = np.zeros_like(u), np.zeros(u.shape, bool)
-    base_u = middle[row, 0].astype(int) + i.ravel()[block]
-    base_v = middle[row, 1].astype(int) + j.ravel()[block]
+    place = 4 * (np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts))
+    shape = (len(near), 4 * max(int(counts.max(initial=0)), 1))
+    out_u, out_v, used = np.zeros(shape, np.int32), np.zeros(shape, np.int32), np.zeros(shape, bool)
+    first = row * shape[1] + place
     for k in range(4):
-        u[row, 4 * place + k], v[row, 4 * place + k] = base_u + stride * (k % 2), base_v + stride * (k // 2)
-        used[row, 4 * place + k] = True
-    u, v = np.where(used, u, middle[:, :1].astype(int)), np.where(used, v, middle[:, 1:].astype(int))
-    grey, inside = _gather(image, u, v)
-    s, t = _local(maps, target, u, v)
-    return RingPixels(target, ring, s, t, grey, used & inside)
+        out_u.reshape(-1)[first + k] = du[block] + stride * (k % 2)
+        out_v.reshape(-1)[first + k] = dv[block] + stride * (k // 2)
+        used.reshape(-1)[first + k] = True
+    anchor = patches.anchor_px.astype(np.int32)
+    grey, inside = _gather(image, anchor[:, :1] + out_u, anchor[:, 1:] + out_v)
+    return RingPixels(ring, patches, out_u.astype(np.float32) / scale, out_v.astype(np.float32) / scale, grey, used & inside)
 
 
-def _local(maps: LocalMaps, target, u, v) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    anchor, scale = maps.anchor_px[target], maps.scale_px[target]
-    s, t = (u - anchor[:, :1]) / scale[:, None], (v - anchor[:, 1:]) / scale[:, None]
-    return s.astype(np.float32), t.astype(np.float32)
-
-
-def _plane_to_second_order(maps: LocalMaps) -> Array:
-    return maps.plane[:, : len(monomials(np.zeros(1), np.zeros(1), 2)[0])]
+def _near_edges(rings: Rings, maps: LocalMaps, ring: Index, s: NDArray[np.float32], t: NDArray[np.float32], reach_px: float) -> NDArray[np.bool_]:
+    """Where points (M, n) lie within `reach_px` of an edge of their ring; to first order, which is enough to choose pixels."""
+    six = maps.plane.astype(np.float32) @ monomials(s, t, maps.degree)
+    x, y, xu, xv, yu, yv = (six[:, k] for k in range(6))
+    near = np.zeros(s.shape, bool)
+    for c in range(rings.radius_mm.shape[1]):
+        dx, dy = x - rings.center_mm[ring, c, :1], y - rings.center_mm[ring, c, 1:]
+        square = dx * dx + dy * dy
+        gu, gv = dx * xu + dy * yu, dx * xv + dy * yv
+        gap = (rings.radius_mm[ring, c, None] - np.sqrt(square)) ** 2 * square
+        near |= (gap < reach_px**2 * (gu * gu + gv * gv)) & (rings.sign[ring, c, None] != 0)
+    return near & (s * s + t * t < 1)

@@ -1,0 +1,127 @@
+"""dishmap: the shape of a dish antenna, or of any printed surface, from photographs by one calibrated camera.
+
+The names below are the public ones. Each is loaded when first used, so that `import dishmap` stays quick:
+
+    import dishmap
+    camera = dishmap.read_camera("camera.yaml")
+    pattern = dishmap.read_pattern("pattern.json")
+    result = dishmap.map_photograph(dishmap.read_gray("photo.png"), camera, pattern, dishmap.Upright())
+
+Lengths are in millimetres, image quantities in pixels, angles in radians; pixel (0, 0) is the centre of the top-left pixel.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dishmap.camera.calibrate import calibrate
+    from dishmap.camera.model import Camera
+    from dishmap.io.camera_file import read_camera, write_camera
+    from dishmap.io.images import read_gray
+    from dishmap.io.pattern_file import read_pattern, write_pattern
+    from dishmap.pipeline import map_photograph
+    from dishmap.simulate.deform import Deformation
+    from dishmap.simulate.render import simulate as simulate_photograph
+    from dishmap.simulate.scene import Scene, Sensor, facing_pose
+    from dishmap.surface.cloud import PointCloud
+    from dishmap.surface.fit import fit_surface
+    from dishmap.targets.builders import dish, plate
+    from dishmap.targets.detect import find_ellipses
+    from dishmap.targets.identify import PoseGuess, Upright, identify
+    from dishmap.targets.pattern import Pattern, Surface, TargetKind
+    from dishmap.targets.pose import measure_targets
+    from dishmap.transforms import Pose
+
+    __version__: str
+
+# Where each public name lives; the imports above say the same to type checkers, and a test holds the two together.
+_HOME = {
+    "Camera": "dishmap.camera.model",
+    "Deformation": "dishmap.simulate.deform",
+    "Pattern": "dishmap.targets.pattern",
+    "PointCloud": "dishmap.surface.cloud",
+    "Pose": "dishmap.transforms",
+    "PoseGuess": "dishmap.targets.identify",
+    "Scene": "dishmap.simulate.scene",
+    "Sensor": "dishmap.simulate.scene",
+    "Surface": "dishmap.targets.pattern",
+    "TargetKind": "dishmap.targets.pattern",
+    "Upright": "dishmap.targets.identify",
+    "calibrate": "dishmap.camera.calibrate",
+    "dish": "dishmap.targets.builders",
+    "facing_pose": "dishmap.simulate.scene",
+    "find_ellipses": "dishmap.targets.detect",
+    "fit_surface": "dishmap.surface.fit",
+    "identify": "dishmap.targets.identify",
+    "map_photograph": "dishmap.pipeline",
+    "measure_targets": "dishmap.targets.pose",
+    "plate": "dishmap.targets.builders",
+    "read_camera": "dishmap.io.camera_file",
+    "read_gray": "dishmap.io.images",
+    "read_pattern": "dishmap.io.pattern_file",
+    "simulate_photograph": "dishmap.simulate.render",
+    "write_camera": "dishmap.io.camera_file",
+    "write_pattern": "dishmap.io.pattern_file",
+}
+
+# `dishmap.simulate` is the package, so its function of that name goes by another one here.
+_OTHER_NAME = {"simulate_photograph": "simulate"}
+
+__all__ = [
+    "Camera",
+    "Deformation",
+    "Pattern",
+    "PointCloud",
+    "Pose",
+    "PoseGuess",
+    "Scene",
+    "Sensor",
+    "Surface",
+    "TargetKind",
+    "Upright",
+    "__version__",
+    "calibrate",
+    "dish",
+    "facing_pose",
+    "find_ellipses",
+    "fit_surface",
+    "identify",
+    "map_photograph",
+    "measure_targets",
+    "plate",
+    "read_camera",
+    "read_gray",
+    "read_pattern",
+    "simulate_photograph",
+    "write_camera",
+    "write_pattern",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name from its module on first use."""
+    value: Any
+    if name == "__version__":
+        value = _version()
+    elif name in _HOME:
+        value = getattr(import_module(_HOME[name]), _OTHER_NAME.get(name, name))
+    else:
+        raise AttributeError(f"module 'dishmap' has no attribute {name!r}; the public names are {', '.join(sorted(_HOME))}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("dishmap")
+    except PackageNotFoundError:
+        # run from a source folder that was never installed
+        return "unknown"

@@ -1,0 +1,1 @@
+"""Photographs with truth, for tests, documentation and benchmarks."""

@@ -1,0 +1,120 @@
+"""The forward map of the simulator: printed position -> nominal surface -> this state -> camera frame -> pixel.
+
+Pixels and truth both come from here.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dishmap.camera.model import Camera
+from dishmap.simulate.deform import deform, displacement_mm
+from dishmap.simulate.scene import Scene
+from dishmap.targets.pattern import bent_print_mm
+
+Array = NDArray[np.float64]
+
+# Central differences of the printed position: over 0.01 mm the truncation and the rounding of the normal stay under 1e-8.
+NORMAL_STEP_MM = 0.01
+OUTLINE_COARSE = 512
+# Chords of half a pixel cut 1e-4 px off a rim of 300 px radius.
+OUTLINE_STEP_PX = 0.5
+# An outline of more steps reaches far beyond any image
+OUTLINE_LONGEST = 400_000
+# Outlines are drawn in to this part of the lens's field
+FIELD_PART = 0.999
+
+
+def rim_radius_mm(scene: Scene) -> float:
+    """The radius at which a Zernike term is 1: the surface's rim, or the outermost ink of a pattern without one."""
+    pattern = scene.pattern
+    if pattern.surface.diameter_mm is not None:
+        return pattern.surface.diameter_mm / 2
+    extent = np.array([kind.extent_mm for kind in map(pattern.kind_of, range(len(pattern)))])
+    return float((np.linalg.norm(pattern.center_mm[:, :2], axis=1) + extent).max())
+
+
+def printed_points(scene: Scene, index: ArrayLike, xy_mm: ArrayLike) -> Array:
+    """Points (..., 3) in the camera frame of printed positions (..., 2) of targets number `index`, which broadcasts to (...)."""
+    pattern = scene.pattern
+    i, xy = np.asarray(index), np.asarray(xy_mm, dtype=float)
+    local = bent_print_mm(xy[..., None, :], pattern.curvature_per_mm[i])[..., 0, :]
+    nominal = pattern.center_mm[i] + np.einsum("...ij,...j->...i", pattern.axes[i], local)
+    return scene.camera_from_dish.apply(deform(scene.deformation, pattern.surface, nominal, rim_radius_mm(scene)))
+
+
+def centers_and_normals(scene: Scene) -> tuple[Array, Array]:
+    """Centres and unit normals (N, 3) of all targets in the camera frame; the normal is that of the printed side."""
+    index = np.arange(len(scene.pattern))
+    steps = NORMAL_STEP_MM * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    points = printed_points(scene, index[:, None], np.broadcast_to(steps, (len(index), 5, 2)))
+    normal = np.cross(points[:, 1] - points[:, 2], points[:, 3] - points[:, 4])
+    return points[:, 0], normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+
+
+def facing(scene: Scene) -> NDArray[np.bool_]:
+    """Which targets (N,) show their printed side to the camera, and are not behind the near rim of the dish."""
+    center, normal = centers_and_normals(scene)
+    shown = np.asarray((center * normal).sum(axis=1) < 0)
+    surface = scene.pattern.surface
+    if surface.focal_length_mm is None or surface.kind == "plane":
+        return shown
+    # The line of sight meets the nominal paraboloid at the target (t = 0) and once more: x, y are rho(t) = start + t along.
+    start = scene.pattern.center_mm
+    along = (scene.camera_from_dish @ scene.deformation.motion).inverse().translation_mm - start
+    across = (along[:, :2] ** 2).sum(axis=1)
+    t = (4 * surface.focal_length_mm * along[:, 2] - 2 * (start * along)[:, :2].sum(axis=1)) / np.maximum(across, 1e-12)
+    rho = np.linalg.norm(start[:, :2] + t[:, None] * along[:, :2], axis=1)
+    return np.asarray(shown & ~((t > 0) & (t < 1) & (rho < rim_radius_mm(scene))))
+
+
+def target_displacement_mm(scene: Scene) -> Array:
+    """Displacement (N,) of the targets' centres along their nominal normals, without expansion and rigid motion."""
+    return displacement_mm(scene.deformation, scene.pattern.center_mm[:, :2], rim_radius_mm(scene))
+
+
+def outline_px(scene: Scene) -> Array:
+    """Outline of the whole surface in the image: a closed polyline (K, 2) with steps of half a pixel.
+
+    The rim of the surface; for a pattern without a diameter, a circle (paraboloid) or a rectangle (plane) around all ink
+    with the scene's margin. What lies outside the lens's field is drawn in to its border.
+    """
+    coarse = _outline_at(scene, np.arange(OUTLINE_COARSE) / OUTLINE_COARSE)
+    longest = np.linalg.norm(np.roll(coarse, -1, axis=0) - coarse, axis=1).max()
+    count = int(np.clip(OUTLINE_COARSE * longest / OUTLINE_STEP_PX, OUTLINE_COARSE, OUTLINE_LONGEST))
+    return _outline_at(scene, np.arange(count) / count)
+
+
+def _outline_at(scene: Scene, t: Array) -> Array:
+    """Outline (K, 2) in pixels at parameters (K,) from 0 to 1."""
+    pattern = scene.pattern
+    if pattern.surface.kind == "plane" and pattern.surface.diameter_mm is None:
+        xy = _rectangle(scene, t)
+    else:
+        radius = rim_radius_mm(scene) + (scene.margin_mm if pattern.surface.diameter_mm is None else 0.0)
+        xy = radius * np.stack([np.cos(2 * np.pi * t), np.sin(2 * np.pi * t)], axis=-1)
+    nominal = np.concatenate([xy, pattern.surface.height_mm(xy)[..., None]], axis=-1)
+    points = scene.camera_from_dish.apply(deform(scene.deformation, pattern.surface, nominal, rim_radius_mm(scene)))
+    return scene.camera.project(_drawn_in(scene.camera, points))
+
+
+def _rectangle(scene: Scene, t: Array) -> Array:
+    """Positions (K, 2) in mm along the plate's edge, counter-clockwise, the four sides equal in t."""
+    pattern = scene.pattern
+    extent = np.array([kind.extent_mm for kind in map(pattern.kind_of, range(len(pattern)))])[:, None]
+    low = (pattern.center_mm[:, :2] - extent).min(axis=0) - scene.margin_mm
+    high = (pattern.center_mm[:, :2] + extent).max(axis=0) + scene.margin_mm
+    corners = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
+    side = np.minimum((4 * t).astype(np.int64), 3)
+    part = (4 * t - side)[:, None]
+    return np.asarray(corners[side] * (1 - part) + corners[(side + 1) % 4] * part)
+
+
+def _drawn_in(camera: Camera, points_mm: Array) -> Array:
+    """Points (K, 3), those outside the lens's field turned towards the axis until they are just inside."""
+    widest = FIELD_PART * (np.arctan(camera.widest) if camera.model == "opencv" else camera.widest)
+    across = np.hypot(points_mm[:, 0], points_mm[:, 1])
+    angle = np.minimum(np.arctan2(across, points_mm[:, 2]), widest)
+    unit = points_mm[:, :2] / np.where(across > 0, across, 1.0)[:, None]
+    return np.concatenate([unit * np.sin(angle)[:, None], np.cos(angle)[:, None]], axis=-1)

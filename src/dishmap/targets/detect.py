@@ -1,0 +1,317 @@
+"""Find circles in a photograph: local threshold, contours, ellipses (the paper's section 4.2, step 1).
+
+The threshold of a pixel is half way between the darkest and the lightest pixel of a small window around it, so it follows
+shading of any strength and needs no idea of a circle's size: only the neighbourhood of edges is ever told apart, and a
+large disc shows as the contour of its edge. A contour that does not follow an edge is dropped point by point, when it
+is moved to the crossing of the threshold between two pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dishmap.errors import ImageError
+from dishmap.targets.ellipses import Fits, enclosing, fit_ellipses, contour_spread
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+# Half width of the window whose darkest and lightest pixels give the threshold. It must hold both sides of an edge blurred
+# by 2 px (sigma); a larger one would let dark surroundings into the windows of circles near them.
+WINDOW_PX = 5
+# The window must hold at least this contrast, as a part of its lightest pixel, in grey levels of 255, and in sigmas of
+# the noise (the range of 121 normal numbers is 5.4 sigmas).
+LEAST_RELATIVE_CONTRAST = 0.15
+LEAST_CONTRAST = 5.0
+LEAST_CONTRAST_SIGMAS = 8.0
+# Above this noise (grey levels of 255) the image is smoothed by a 3x3 kernel first.
+SMOOTH_ABOVE_NOISE = 2.0
+# Rows treated at a time, to keep the memory small.
+BAND_ROWS = 512
+# Above this many pixels the search runs at half resolution first.
+HALVE_ABOVE_PX = 6_000_000
+# Circles found at half resolution with a smaller half axis than this are too coarse there, and so is the search when
+# more than the given part of its circles, or of its contours of one blob each, is that small.
+COARSE_PX = 4.0
+COARSE_PART = 0.2
+# A second, coarser search finds large circles with ragged edges.
+SECOND_REDUCTION = 4
+# Contours: fewest points, and the limits that an ellipse must meet.
+FEWEST_POINTS = 8
+LARGEST_SPREAD = 0.17
+LEAST_GOOD_POINTS = 0.75
+SMALLEST_SEMI_AXIS_PX = 1.2
+LEAST_AXIS_RATIO = 0.2
+RMS_PX, RMS_PART = 0.12, 0.03
+AREA_TOLERANCE = 0.2
+# Two finds are the same circle when the centres agree to this many px of the coarser one and the sizes to this part.
+SAME_CENTER_PX, SAME_SIZE = 1.5, 0.1
+# Spacing of the samples of darkest and lightest pixels that `Ground` keeps.
+GROUND_STEP = 8
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Darkest and lightest grey level around points of a coarse grid, to see where the ground is blank.
+
+    darkest, lightest (h, w): within about half a step of the point; point (row, column) stands at full-resolution pixel
+    `origin_px + step_px * (column, row)`.
+    """
+
+    darkest: NDArray[np.float32]
+    lightest: NDArray[np.float32]
+    origin_px: float
+    step_px: float
+
+
+@dataclass(frozen=True)
+class Detections:
+    """Ellipses found in an image, in full-resolution pixels; (0, 0) is the centre of the top-left pixel.
+
+    center_px (M, 2); semi_axes_px (M, 2), major first; angle_rad (M,) of the major axis from +u towards +v; dark (M,): the
+    inside is darker; parent (M,): index of the smallest ellipse around each, or -1; contrast (M,) between inside and
+    outside at the edge, grey levels; residual_px (M,): rms distance of the contour to the ellipse. Ellipses that the
+    border of the image cuts are not listed. ground: where the image is blank, if known.
+    """
+
+    center_px: Array
+    semi_axes_px: Array
+    angle_rad: Array
+    dark: NDArray[np.bool_]
+    parent: NDArray[np.int64]
+    contrast: Array
+    residual_px: Array
+    ground: Ground | None = None
+
+    def __len__(self) -> int:
+        return len(self.center_px)
+
+
+def find_ellipses(gray: NDArray[Any], full_resolution: bool = False) -> Detections:
+    """Find the circles of an image as ellipses.
+
+    gray: (H, W) uint8 or uint16. full_resolution: search a large image at full resolution even where half seems enough.
+    Raises ImageError when the image is not such an array.
+    """
+    if not isinstance(gray, np.ndarray) or gray.ndim != 2 or gray.dtype not in (np.uint8, np.uint16) or not gray.size:
+        found = f"{gray.dtype} {gray.shape}" if isinstance(gray, np.ndarray) else type(gray).__name__
+        raise ImageError(f"circles are searched in a grey image (H, W) of uint8 or uint16, not in {found}; convert it first")
+    white = _white_level(gray)
+    halve = gray.size > HALVE_ABOVE_PX and not full_resolution
+    base = 2 if halve else 1
+    image = _reduced(gray, base, white)
+    noise = _noise(image)
+    found, ground, small = _search(image, base, noise)
+    if halve and _too_coarse(found, base, small):
+        found, ground, _ = _search(_reduced(gray, 1, white), 1, noise * 2)
+        base = 1
+    if min(image.shape) >= 16 * SECOND_REDUCTION:
+        second = 2 * SECOND_REDUCTION if halve else SECOND_REDUCTION
+        coarse, _, _ = _search(_reduced(image, SECOND_REDUCTION, 255.0), second, noise / SECOND_REDUCTION)
+        found = _merged(found, coarse)
+    return _detections(found, ground, white / 255.0)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Ellipses in full-resolution pixels; reduction (M,) at which each was found."""
+
+    center: Array
+    semi_axes: Array
+    angle: Array
+    dark: NDArray[np.bool_]
+    contrast: Array
+    residual: Array
+    reduction: Array
+
+    def take(self, index: NDArray[Any]) -> _Found:
+        return _Found(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+
+def _white_level(gray: NDArray[Any]) -> float:
+    """Grey level that becomes 255: all of an 8-bit image, and the light end of the pixels of a 16-bit one."""
+    if gray.dtype == np.uint8:
+        return 255.0
+    sample = gray[:: max(1, gray.shape[0] // 500), :: max(1, gray.shape[1] // 500)]
+    return float(max(1.2 * np.percentile(sample, 99.5), 255.0))
+
+
+def _reduced(image: NDArray[Any], factor: int, white: float) -> Image:
+    """The image averaged over blocks of factor x factor pixels, as 8 bit; rows and columns left over are dropped."""
+    h, w = image.shape[0] // factor, image.shape[1] // factor
+    if factor > 1:
+        image = cv2.resize(image[: h * factor, : w * factor], (w, h), interpolation=cv2.INTER_AREA)
+    if image.dtype != np.uint8:
+        image = cv2.convertScaleAbs(image, alpha=255.0 / white)
+    return np.ascontiguousarray(image)
+
+
+def _noise(image: Image) -> float:
+    """Standard deviation of the noise, grey levels: from the median difference of diagonal 2x2 sums."""
+    rows = image[:: max(1, image.shape[0] // 64)].astype(np.int16)
+    if rows.shape[1] < 4:
+        return 0.0
+    second = rows[:, 2:] - 2 * rows[:, 1:-1] + rows[:, :-2]
+    return float(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0))
+
+
+def _search(image: Image, reduction: int, noise: float) -> tuple[_Found, Ground, int]:
+    """All ellipses of one image; also how many small blobs its contours hold."""
+    if noise > SMOOTH_ABOVE_NOISE:
+        image, noise = cv2.GaussianBlur(image, (3, 3), 0), noise / 2.5
+    threshold, ink, ground = _binarise(image, max(LEAST_CONTRAST, LEAST_CONTRAST_SIGMAS * noise), reduction)
+    contours, _ = cv2.findContours(ink, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    del ink
+    small = sum(1 for c in contours if 4 <= len(c) < FEWEST_POINTS)
+    contours = [c for c in contours if len(c) >= FEWEST_POINTS]
+    if not contours:
+        return _nothing(), ground, small
+    return _ellipses(image, threshold, contours, reduction), ground, small
+
+
+def _binarise(image: Image, least_contrast: float, reduction: int) -> tuple[Image, Image, Ground]:
+    """Threshold of each pixel, where the image is ink (255), and the coarse map of its ground."""
+    threshold, ink = np.empty_like(image), np.empty_like(image)
+    kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * WINDOW_PX + 1, 2 * WINDOW_PX + 1))
+    darkest, lightest = [], []
+    for top, bottom in _bands(len(image)):
+        first, last = max(0, top - WINDOW_PX), min(len(image), bottom + WINDOW_PX)
+        inner = slice(top - first, bottom - first)
+        low, high = (f(image[first:last], kernel)[inner] for f in (cv2.erode, cv2.dilate))
+        cv2.addWeighted(low, 0.5, high, 0.5, 0.0, dst=threshold[top:bottom])
+        # contrast of the window against its own limit: high - low > max(least, part * high)
+        limit = cv2.max(cv2.convertScaleAbs(high, alpha=LEAST_RELATIVE_CONTRAST), least_contrast)
+        edges = cv2.compare(cv2.subtract(high, low), limit, cv2.CMP_GT)
+        cv2.bitwise_and(cv2.compare(image[top:bottom], threshold[top:bottom], cv2.CMP_LT), edges, dst=ink[top:bottom])
+        darkest.append(low[::GROUND_STEP, ::GROUND_STEP].astype(np.float32))
+        lightest.append(high[::GROUND_STEP, ::GROUND_STEP].astype(np.float32))
+    ground = Ground(np.concatenate(darkest), np.concatenate(lightest), (reduction - 1) / 2, float(GROUND_STEP * reduction))
+    return threshold, ink, ground
+
+
+def _bands(rows: int) -> Iterator[tuple[int, int]]:
+    for top in range(0, rows, BAND_ROWS):
+        yield top, min(rows, top + BAND_ROWS)
+
+
+def _ellipses(image: Image, threshold: Image, contours: list[NDArray[np.int32]], reduction: int) -> _Found:
+    """Ellipses of the contours that pass all tests, in full-resolution pixels."""
+    points, starts = _concatenated(contours)
+    keep = contour_spread(points, starts) < LARGEST_SPREAD
+    if not keep.any():
+        return _nothing()
+    points, starts = _concatenated([c for c, k in zip(contours, keep, strict=True) if k])
+    counts = np.diff(np.append(starts, len(points)))
+    moved, shift, good, contrast = _to_crossing(image, threshold, points)
+    weights = good.astype(float)
+    enough = np.add.reduceat(weights, starts) >= np.maximum(LEAST_GOOD_POINTS * counts, FEWEST_POINTS - 2)
+    fits = fit_ellipses(moved, starts, weights)
+    outward = (shift * (points - np.repeat(fits.center, counts, axis=0))).sum(axis=1) * weights
+    dark = np.add.reduceat(outward, starts) > 0
+    contrast_mean = np.add.reduceat(contrast * weights, starts) / np.maximum(np.add.reduceat(weights, starts), 1.0)
+    with np.errstate(invalid="ignore"):
+        keep = enough & _is_ellipse(fits, _area(moved, starts, counts))
+    found = _Found(
+        fits.center * reduction + (reduction - 1) / 2,
+        fits.semi_axes * reduction,
+        fits.angle_rad,
+        dark,
+        contrast_mean,
+        fits.rms * reduction,
+        np.full(len(starts), float(reduction)),
+    )
+    return found.take(np.flatnonzero(keep))
+
+
+def _concatenated(contours: list[NDArray[np.int32]]) -> tuple[Array, NDArray[np.int64]]:
+    points = np.concatenate(contours)[:, 0].astype(float)
+    return points, np.cumsum([0] + [len(c) for c in contours[:-1]])
+
+
+def _is_ellipse(fits: Fits, area: Array) -> NDArray[np.bool_]:
+    major, minor = fits.semi_axes.T
+    return np.asarray(
+        (minor >= SMALLEST_SEMI_AXIS_PX)
+        & (minor >= LEAST_AXIS_RATIO * major)
+        & (fits.rms <= RMS_PX + RMS_PART * np.sqrt(major * minor))
+        & (np.abs(area / (np.pi * major * minor) - 1) <= AREA_TOLERANCE)
+    )
+
+
+def _area(points: Array, starts: NDArray[np.int64], counts: NDArray[np.int64]) -> Array:
+    """Area (M,) of each closed contour."""
+    following = np.arange(1, len(points) + 1)
+    following[starts + counts - 1] = starts
+    x, y = points.T
+    return np.abs(np.add.reduceat(x * y[following] - x[following] * y, starts)) / 2
+
+
+def _to_crossing(image: Image, threshold: Image, points: Array) -> tuple[Array, Array, NDArray[np.bool_], Array]:
+    """Move contour pixels (N, 2), the last ink before the ground, to where the grey level crosses the threshold.
+
+    The crossing is taken between the pixel and its neighbour along the row or column, whichever is steeper, by linear
+    interpolation: so the contour lies neither on the inner nor on the outer side. Returns the points, the unit steps
+    towards the ground, where there is a crossing, and the contrast there.
+    """
+    h, w = image.shape
+    x, y = points.T.astype(np.intp)
+    inside = (x > 0) & (y > 0) & (x < w - 1) & (y < h - 1)
+    xs, ys = np.clip(x, 1, max(1, w - 2)), np.clip(y, 1, max(1, h - 2))
+    flat, at = image.ravel(), ys * w + xs
+    here, level = flat[at].astype(float), threshold.ravel()[at].astype(float)
+    right, left, down, up = (flat[np.clip(at + k, 0, flat.size - 1)].astype(float) for k in (1, -1, w, -w))
+    along_x, along_y = np.maximum(right, left), np.maximum(down, up)
+    row = np.abs(right - left) >= np.abs(down - up)
+    best = np.where(row, along_x, along_y)
+    row = np.where(best > level, row, ~row)
+    best = np.where(row, along_x, along_y)
+    good = inside & (best > level)
+    part = np.where(good, (level - here) / np.where(good, best - here, 1.0), 0.0)
+    sign_x, sign_y = np.where(right >= left, 1.0, -1.0), np.where(down >= up, 1.0, -1.0)
+    step = np.stack([np.where(row, sign_x, 0.0), np.where(row, 0.0, sign_y)], axis=1)
+    return points + step * np.clip(part, 0.0, 1.0)[:, None], step, good, 2 * (level - _darkest(flat, at, w, here))
+
+
+def _darkest(flat: Image, at: NDArray[np.intp], width: int, here: Array) -> Array:
+    """Darkest of the pixel and its eight neighbours, so that the contrast counts the ink's own depth."""
+    for k in (1, -1, width, -width, width + 1, width - 1, -width + 1, -width - 1):
+        here = np.minimum(here, flat[np.clip(at + k, 0, flat.size - 1)])
+    return here
+
+
+def _too_coarse(found: _Found, reduction: int, small_blobs: int) -> bool:
+    """Whether many circles, or many blobs that are no circles at this resolution, are too small for it."""
+    dark = found.dark
+    small = int((found.semi_axes[dark, 1] < COARSE_PX * reduction).sum())
+    return not dark.any() or small > COARSE_PART * dark.sum() or small_blobs > dark.sum() / COARSE_PART
+
+
+def _merged(fine: _Found, coarse: _Found) -> _Found:
+    """Both sets, without those of the coarse search that the fine one has."""
+    from scipy.spatial import cKDTree
+
+    if not len(coarse.center) or not len(fine.center):
+        return fine if not len(coarse.center) else coarse
+    tolerance = SAME_CENTER_PX * coarse.reduction[0]
+    a, b = (np.column_stack([f.center, np.log(f.semi_axes.prod(axis=1)) / 2 * tolerance / SAME_SIZE]) for f in (fine, coarse))
+    distance, nearest = cKDTree(np.column_stack([a, 1e9 * fine.dark])).query(np.column_stack([b, 1e9 * coarse.dark]), p=np.inf)
+    new = coarse.take(np.flatnonzero(distance > tolerance))
+    return _Found(*(np.concatenate([getattr(fine, n), getattr(new, n)]) for n in fine.__dataclass_fields__))
+
+
+def _nothing() -> _Found:
+    none = np.zeros(0)
+    return _Found(np.zeros((0, 2)), np.zeros((0, 2)), none, np.zeros(0, dtype=bool), none, none, none)
+
+
+def _detections(found: _Found, ground: Ground, grey_levels: float) -> Detections:
+    scaled = Ground(ground.darkest * np.float32(grey_levels), ground.lightest * np.float32(grey_levels), ground.origin_px, ground.step_px)
+    parent = enclosing(found.center, found.semi_axes, found.angle)
+    contrast = found.contrast * grey_levels
+    return Detections(found.center, found.semi_axes, found.angle, found.dark, parent, contrast, found.residual, scaled)

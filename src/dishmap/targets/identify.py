@@ -1,0 +1,365 @@
+"""Name the detected circles: which mark of the pattern is which ellipse, and from where the camera looks.
+
+A wrong name is worse than a missing one. The pattern is placed once, by constellations of neighbours and growth; then every
+turn or shift of the pattern that explains the detections nearly as well is found in the pattern itself, and unless
+the user's hint leaves exactly one of them, all are listed and none is chosen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dishmap.camera.model import Camera
+from dishmap.errors import IdentityError
+from dishmap.targets.candidates import Candidates, mark_candidates
+from dishmap.targets.detect import Detections
+from dishmap.targets.growth import Embedding, Scene, fit_pose, grow, is_clean, misfit_of
+from dishmap.targets.layout import Layout, layout_of
+from dishmap.targets.pattern import Pattern
+from dishmap.targets.rivals import Observations, Rivals, find_rivals, observe
+from dishmap.targets.search import find_placement, rest_of, scene_of, worth
+from dishmap.transforms import Pose
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+# A placement beats another when it explains at least this many more observations (marks seen, or marks not contradicted): a
+# stray circle of the right size in the right place, once or twice, must not decide.
+DECISIVE = 3
+# ... or when both explain the same, and the other leaves residuals this many times larger, over enough marks.
+DECISIVE_MISFIT, FEWEST_FOR_MISFIT = 3.0, 8
+# Rivals whose marks meet only roughly are grown in the image to see what they explain; so many at most.
+ROUGH_MISFIT, MOST_REGROWN = 0.04, 6
+MOST_CHANGES = 4
+# Rivals are listed up to this deficit; options that agree on this part of their marks are one.
+LISTED_DEFICIT = 12
+SAME_PART = 0.5
+# What the hints promise.
+UPRIGHT_RAD = np.radians(45.0)
+GUESS_TURN_RAD, GUESS_SHIFT_MM = np.radians(20.0), 100.0
+# Fewer matched targets, as a part of those that should be seen, are no find; nor is a find with more look-alikes outside it.
+LEAST_SEEN_PART = 0.25
+LEAST_WHOLE_PART = 0.5
+LISTED_POSES = 12
+# A placement needs this many marks; a further copy also this part of the first one's.
+FEWEST_MARKS = 4
+COPY_PART = 0.3
+MOST_COPIES = 4
+
+
+@dataclass(frozen=True)
+class Upright:
+    """Hint: the camera looks along the pattern's -z with the pattern's y up in the image, turned by less than 45 degrees."""
+
+
+@dataclass(frozen=True)
+class PoseGuess:
+    """Hint: the pose of the pattern, right to some degrees and centimetres (within 20 degrees and 100 mm)."""
+
+    camera_from_dish: Pose
+
+
+Hint = Upright | PoseGuess | None
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """A pose in which the pattern could sit too, and by how many observations it explains less."""
+
+    camera_from_dish: Pose
+    deficit: float
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """A detection that could be a mark but is not used, and why."""
+
+    detection: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Identity:
+    """The pattern found in an image.
+
+    camera_from_dish: robust rigid fit (a deformed surface follows it only roughly); mark (K,): indices into pattern.marks;
+    detection (K,): the ellipse that each is; residual_px (K,): distance from where the rigid pose puts the mark; alternatives:
+    next best placements that were ruled out; unmatched: number of detections that look like marks but are none;
+    rejected: these with reasons.
+    """
+
+    camera_from_dish: Pose
+    mark: Index
+    detection: Index
+    residual_px: Array
+    alternatives: tuple[Alternative, ...]
+    unmatched: int
+    rejected: tuple[Rejection, ...]
+
+
+@dataclass(frozen=True)
+class _Option:
+    """One way the pattern could sit: where it was searched, the placement it was made from, its pose and its pairs."""
+
+    scene: Scene
+    placement: Embedding
+    pose: Pose
+    pairs: tuple[Index, Index]
+    deficit: float
+
+
+def identify(detections: Detections, pattern: Pattern, camera: Camera, hint: Hint = None) -> Identity:
+    """Find the pattern among detected ellipses.
+
+    hint: None, Upright() or PoseGuess(camera_from_dish). Raises IdentityError when the pattern is not found, or could
+    sit in more than one way that the hint does not tell apart; the message lists these ways.
+    """
+    candidates = mark_candidates(detections, pattern.marks, camera)
+    _check_enough(detections, candidates, pattern)
+    scene = scene_of(candidates, layout_of(pattern), camera)
+    options: list[_Option] = []
+    copies = 0
+    least = FEWEST_MARKS
+    while copies < MOST_COPIES:
+        placement = find_placement(scene, least)
+        if placement is None:
+            break
+        found = _options(scene, pattern, placement)
+        options += found
+        copies += 1
+        least = max(least, int(np.ceil(COPY_PART * found[0].placement.count)))
+        scene = rest_of(scene, found[0].placement)
+    if not options:
+        raise IdentityError(
+            f"the pattern {pattern.name!r} was not found among {len(candidates)} circles that look like its marks; "
+            "check that pattern and camera belong to this photograph and that several neighbouring targets are in view"
+        )
+    chosen = _chosen([o for o in options if o.deficit < DECISIVE], hint, pattern, copies)
+    final = _settled(chosen)
+    _check_find(chosen.scene, pattern, final)
+    others = [Alternative(o.pose, o.deficit) for o in options if o is not chosen]
+    return _identity(chosen.scene, final, others)
+
+
+def _check_enough(detections: Detections, candidates: Candidates, pattern: Pattern) -> None:
+    usable = int(candidates.is_type.any(axis=1).sum())
+    if usable < FEWEST_MARKS:
+        raise IdentityError(
+            f"only {usable} of {len(detections)} ellipses in the image look like marks of the pattern {pattern.name!r}, and at least "
+            f"{FEWEST_MARKS} are needed; check focus, exposure and that this is the printed pattern"
+        )
+
+
+def _options(scene: Scene, pattern: Pattern, placement: Embedding) -> list[_Option]:
+    """The placement or a better rival of it first, then its rivals with their deficits against it."""
+    for _ in range(MOST_CHANGES):
+        seen = observe(scene, placement)
+        rivals = find_rivals(scene, placement, seen)
+        order = np.argsort(rivals.cost[1:], kind="stable") + 1
+        best = int(order[0]) if len(order) else 0
+        moved = _moved(scene, placement, seen, rivals, best) if rivals.cost[best] < rivals.cost[0] else None
+        clean = is_clean(scene.layout, placement)
+        rough = [] if moved is not None or clean else _regrown(scene, placement, seen, rivals, order)
+        moved = max([e for e in (moved, *rough) if e is not None], key=worth, default=None)
+        if moved is None or worth(moved) <= worth(placement):
+            break
+        placement = moved
+    options = [_Option(scene, placement, placement.fit.pose, _pairs(placement), 0.0)]
+    options += [_rough_option(scene, placement, other) for other in rough]
+    for h in order:
+        deficit = float(rivals.cost[h] - rivals.cost[0])
+        if deficit < LISTED_DEFICIT and (clean or not _is_rough(rivals, int(h))):
+            option = _exact_option(scene, placement, seen, rivals, int(h), deficit)
+            options += [option] if option is not None else []
+    return _distinct(options, scene.layout)
+
+
+def _is_rough(rivals: Rivals, h: int) -> bool:
+    return bool(rivals.misfit[h] > ROUGH_MISFIT)
+
+
+def _regrown(scene: Scene, placement: Embedding, seen: Observations, rivals: Rivals, order: Index) -> list[Embedding]:
+    """Rivals that carry marks only near marks: grown in the image, since a bent surface could make up for the difference."""
+    chosen = [int(h) for h in order if _is_rough(rivals, int(h))][:MOST_REGROWN]
+    grown = [_moved(scene, placement, seen, rivals, h) for h in chosen]
+    return [e for e in grown if e is not None and e.count >= FEWEST_MARKS]
+
+
+def _distinct(options: list[_Option], layout: Layout) -> list[_Option]:
+    """Options without those that name the same candidates in the same way as an earlier one does."""
+    kept: list[_Option] = []
+    for option in options:
+        if not any(_same(option, other, len(layout)) for other in kept):
+            kept.append(option)
+    return kept
+
+
+def _same(a: _Option, b: _Option, marks: int) -> bool:
+    first, second = np.full(marks, -1), np.full(marks, -2)
+    first[a.pairs[0]], second[b.pairs[0]] = a.pairs[1], b.pairs[1]
+    return int((first == second).sum()) > SAME_PART * min(len(a.pairs[0]), len(b.pairs[0]))
+
+
+def _pairs(placement: Embedding) -> tuple[Index, Index]:
+    marks = np.flatnonzero(placement.candidate >= 0)
+    return marks, placement.candidate[marks]
+
+
+def _relabelled(seen: Observations, rivals: Rivals, h: int) -> tuple[Index, Index]:
+    """Marks and candidates that motion h pairs, each mark once."""
+    hit = np.flatnonzero(rivals.mark[h] >= 0)
+    _, first = np.unique(rivals.mark[h][hit], return_index=True)
+    hit = hit[first]
+    return rivals.mark[h][hit], seen.candidate[hit]
+
+
+def _moved(scene: Scene, placement: Embedding, seen: Observations, rivals: Rivals, h: int) -> Embedding | None:
+    """The placement grown anew from the pairs that motion h gives."""
+    pose = placement.fit.pose @ rivals.motion(h).inverse()
+    return grow(scene, pose, *_relabelled(seen, rivals, h))
+
+
+def _exact_option(scene: Scene, placement: Embedding, seen: Observations, rivals: Rivals, h: int, deficit: float) -> _Option | None:
+    """A rival that carries marks onto marks: what it explains is known without the image."""
+    pairs = _relabelled(seen, rivals, h)
+    match = np.full(len(scene.layout), -1)
+    match[pairs[0]] = pairs[1]
+    fit = fit_pose(scene, placement.fit.pose @ rivals.motion(h).inverse(), match, try_other=False)
+    if fit is None:
+        return None
+    misfit = misfit_of(scene, fit.pose, *pairs)
+    return _Option(scene, placement, fit.pose, pairs, max(deficit, _misfit_deficit(placement, misfit, len(pairs[0]))))
+
+
+def _rough_option(scene: Scene, placement: Embedding, other: Embedding) -> _Option:
+    deficit = max(float(placement.count - other.count), _misfit_deficit(placement, other.misfit_px, other.count))
+    return _Option(scene, other, other.fit.pose, _pairs(other), deficit)
+
+
+def _misfit_deficit(placement: Embedding, misfit_px: float, count: int) -> float:
+    """Decisive when the rival fits its marks far worse than the placement does."""
+    worse = misfit_px > DECISIVE_MISFIT * placement.misfit_px
+    return float(DECISIVE) if worse and min(count, placement.count) >= FEWEST_FOR_MISFIT else 0.0
+
+
+def _chosen(options: list[_Option], hint: Hint, pattern: Pattern, copies: int) -> _Option:
+    """The one option that the hint allows."""
+    allowed = [o for o in options if _agrees(o.pose, hint)]
+    if len(allowed) == 1:
+        return allowed[0]
+    if not allowed:
+        said = "upright" if isinstance(hint, Upright) else "where the pose guess has it"
+        raise IdentityError(
+            f"the pattern {pattern.name!r} was found, but not {said}: {_listing(options, hint)}; correct the hint, or turn the photograph"
+        )
+    many = f"{copies} copies of the pattern are in view and" if copies > 1 else "the pattern"
+    advice = "give --upright or a --pose-guess" if hint is None else "give a closer --pose-guess"
+    raise IdentityError(
+        f"{many} {pattern.name!r} could sit in {len(allowed)} ways that the photograph does not tell apart: {_listing(allowed, hint)}; "
+        f"{advice}, show more of the pattern, or print it with orientation marks"
+    )
+
+
+def _agrees(pose: Pose, hint: Hint) -> bool:
+    if isinstance(hint, Upright):
+        return abs(roll_rad(pose)) < UPRIGHT_RAD
+    if isinstance(hint, PoseGuess):
+        turn, shift = _difference(pose, hint.camera_from_dish)
+        return turn < GUESS_TURN_RAD and shift < GUESS_SHIFT_MM
+    return True
+
+
+def _difference(pose: Pose, other: Pose) -> tuple[float, float]:
+    turn = np.linalg.norm((pose.inverse() @ other).rotation_vector_rad)
+    return float(turn), float(np.linalg.norm(pose.translation_mm - other.translation_mm))
+
+
+def roll_rad(pose: Pose) -> float:
+    """Turn of the pattern about its boresight against upright, whatever its tilt, in (-pi, pi].
+
+    The twist about z of dish_from_upright, the rest being a tilt about an axis at right angles to z (swing-twist
+    decomposition): a turn of the pattern about its own z adds to it exactly.
+    """
+    relative = np.diag([1.0, -1.0, -1.0]) @ pose.rotation
+    return float(np.arctan2(relative[1, 0] - relative[0, 1], relative[0, 0] + relative[1, 1]))
+
+
+def _listing(options: list[_Option], hint: Hint) -> str:
+    texts = []
+    for option in sorted(options, key=lambda o: roll_rad(o.pose))[:LISTED_POSES]:
+        x, y, z = option.pose.translation_mm
+        text = f"turned by {np.degrees(roll_rad(option.pose)):+.0f} degrees about the boresight at ({x:.0f}, {y:.0f}, {z:.0f}) mm"
+        if isinstance(hint, PoseGuess):
+            turn, shift = _difference(option.pose, hint.camera_from_dish)
+            text += f" ({np.degrees(turn):.0f} degrees and {shift:.0f} mm from the guess)"
+        texts.append(text)
+    more = f", and {len(options) - LISTED_POSES} more" if len(options) > LISTED_POSES else ""
+    return "; ".join(texts) + more
+
+
+def _settled(chosen: _Option) -> Embedding:
+    """The chosen option as a placement."""
+    if chosen.placement.fit.pose is chosen.pose:
+        return chosen.placement
+    final = grow(chosen.scene, chosen.pose, *chosen.pairs)
+    return chosen.placement if final is None else final
+
+
+def _check_find(scene: Scene, pattern: Pattern, final: Embedding) -> None:
+    """Raise IdentityError when too little of the pattern was found for a find."""
+    layout, candidates = scene.layout, scene.candidates
+    marks, used = _pairs(final)
+    if len(marks) < FEWEST_MARKS:
+        raise IdentityError(f"only {len(marks)} marks of the pattern {pattern.name!r} were found, and at least {FEWEST_MARKS} are needed")
+    inside = scene.camera.contains(final.prediction.predicted_px)
+    expected, found = (len(np.unique(layout.target[m])) for m in (np.flatnonzero(inside), marks))
+    if found < LEAST_SEEN_PART * expected:
+        raise IdentityError(
+            f"only {found} of {expected} targets of the pattern {pattern.name!r} that should be in view were found; "
+            "check that it is the printed pattern"
+        )
+    whole = candidates.is_type[used, layout.type_index[marks]].mean()
+    if whole < LEAST_WHOLE_PART:
+        raise IdentityError(
+            f"the circles found lack what the pattern {pattern.name!r} prints inside them ({100 * (1 - whole):.0f} % of them); "
+            "check that it is the printed pattern"
+        )
+    alike = len(observe(scene, final).candidate) - len(marks)
+    if alike > len(marks):
+        raise IdentityError(
+            f"{len(marks)} circles fit the pattern {pattern.name!r}, but {alike} more look like its marks and fit nowhere; "
+            "check that it is the printed pattern, and that only one copy of it is in view"
+        )
+
+
+def _identity(scene: Scene, final: Embedding, others: list[Alternative]) -> Identity:
+    marks, used = _pairs(final)
+    predicted = scene.camera.project(final.fit.pose.apply(scene.layout.center_mm[marks]))
+    residual = np.linalg.norm(scene.candidates.center_px[used] - predicted, axis=1)
+    left = np.setdiff1d(np.flatnonzero(scene.candidates.is_type.any(axis=1)), used)
+    rejected = tuple(Rejection(int(scene.candidates.detection[i]), _reason(scene, final, int(i))) for i in left)
+    detection = scene.candidates.detection[used]
+    return Identity(final.fit.pose, marks, detection, residual, tuple(sorted(others, key=lambda o: o.deficit)), len(left), rejected)
+
+
+def _reason(scene: Scene, final: Embedding, candidate: int) -> str:
+    """Why a candidate is no mark."""
+    prediction, layout = final.prediction, scene.layout
+    distance = np.linalg.norm(prediction.predicted_px - scene.candidates.center_px[candidate], axis=1)
+    if not np.isfinite(distance).any():
+        return "no mark of the pattern is expected in view"
+    nearest = int(np.nanargmin(distance))
+    size = np.sqrt(abs(np.linalg.det(prediction.affine[nearest])))
+    if distance[nearest] > 0.5 * size * layout.spacing_mm[nearest]:
+        return "no mark of the pattern is expected there"
+    if final.candidate[nearest] >= 0:
+        return "the mark expected there was found beside it"
+    if not scene.candidates.is_type[candidate, layout.type_index[nearest]]:
+        return "it looks unlike the mark expected there"
+    log_size = np.log(scene.candidates.size_px[candidate] / (size * layout.radius_mm[nearest])) - prediction.log_ratio
+    if abs(log_size) > np.log(1.2):
+        return f"it is {100 * (np.exp(log_size) - 1):+.0f} % off the size of the mark expected there"
+    return f"it lies {distance[nearest]:.1f} px from where its neighbours put the mark"
