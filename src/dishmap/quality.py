@@ -41,7 +41,7 @@ MEANING: dict[Quality, str] = {
     Quality.NO_CONTRAST: "too little contrast between ink and ground for a measurement",
 }
 
-REJECTED: Quality = Quality.CLIPPED | Quality.NOT_CONVERGED | Quality.NO_CONTRAST | Quality.OFF_SURFACE
+REJECTED: Quality = Quality.CLIPPED | Quality.NOT_CONVERGED | Quality.NO_CONTRAST
 
 
 def names(bits: int) -> str:

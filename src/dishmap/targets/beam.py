@@ -20,6 +20,8 @@ Index = NDArray[np.int64]
 # Neighbours of the seed looked at in each stage, and hypotheses kept after it.
 STAGES = ((12, 120), (40, 30), (120, 8), (400, 3))
 STEPS = 2
+# Neighbours of the seed whose matches are handed on.
+SURE = 30
 # Residuals well above this part of the spacing of marks have little weight.
 SOFT_PART = 0.1
 # Poses closer than this to one another (parts of the spacing at the seed, rad) are one.
@@ -53,7 +55,8 @@ def sort_out(scene: Scene, guesses: Hypotheses) -> list[Ranked]:
             break
     ranked = []
     for h in range(len(rotation)):
-        hit = np.flatnonzero(mark[h] >= 0)
+        # far from the seed a bent surface may have led to the wrong marks: growth finds these anew
+        hit = np.flatnonzero(mark[h, :SURE] >= 0)
         marks, first = np.unique(mark[h][hit], return_index=True)
         ranked.append(Ranked(Pose(rotation[h], shift[h]), marks, near[hit[first]]))
     return ranked

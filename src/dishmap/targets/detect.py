@@ -42,10 +42,11 @@ COARSE_PX = 4.0
 COARSE_PART = 0.2
 # A second, coarser search finds large circles with ragged edges.
 SECOND_REDUCTION = 4
-# Contours: fewest points, and the limits that an ellipse must meet.
+# Contours: fewest points; the largest spread (see `contour_spread`), to which each pixel of a small contour adds; and the
+# limits that an ellipse must meet.
 FEWEST_POINTS = 8
-LARGEST_SPREAD = 0.17
-LEAST_GOOD_POINTS = 0.75
+LARGEST_SPREAD = (0.16, 1.5)
+LEAST_GOOD_POINTS = 0.6
 SMALLEST_SEMI_AXIS_PX = 1.2
 LEAST_AXIS_RATIO = 0.2
 RMS_PX, RMS_PART = 0.12, 0.03
@@ -203,7 +204,8 @@ def _bands(rows: int) -> Iterator[tuple[int, int]]:
 def _ellipses(image: Image, threshold: Image, contours: list[NDArray[np.int32]], reduction: int) -> _Found:
     """Ellipses of the contours that pass all tests, in full-resolution pixels."""
     points, starts = _concatenated(contours)
-    keep = contour_spread(points, starts) < LARGEST_SPREAD
+    counts = np.diff(np.append(starts, len(points)))
+    keep = contour_spread(points, starts) < LARGEST_SPREAD[0] + LARGEST_SPREAD[1] / counts
     if not keep.any():
         return _nothing()
     points, starts = _concatenated([c for c, k in zip(contours, keep, strict=True) if k])

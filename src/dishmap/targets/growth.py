@@ -33,11 +33,17 @@ GATE_RADIUS, GATE_SIGMAS, GATE_PX = 0.35, 6.0, 0.7
 SIZE_TOLERANCE, SIZE_TOLERANCE_PX = 0.2, 0.5
 # A mark of which printed circles are not seen must agree better: to this part of the limits above.
 DAMAGED_GATE = 0.5
-# A mark with fewer matched neighbours is predicted only if the rigid pose is known this well, as a part of its spacing.
+# A mark with fewer matched neighbours, but some, is predicted only if the rigid pose is known this well, as a part of its
+# spacing. Farther away a bent surface could bring the wrong mark to the predicted place.
 FEWEST_NEIGHBOURS = 3
 RIGID_SIGMA = 0.05
+# Where it has no matched neighbour at all, the surface must so far be this stiff, and the mark not beyond this many times the
+# reach of the matches: what bending they hide grows with the square of the distance.
+STIFF_PART, STIFF_REACH = 0.015, 1.6
 # Ridge of the local correction: weight of "no offset" and of "no gradient", in matched neighbours.
 RIDGE_OFFSET, RIDGE_GRADIENT = 0.05, 0.3
+# Look-alikes count within this many spacings.
+STRANGER_PART = 1.5
 MOST_WAVES = 60
 # Waves without progress after which growth ends; the tilt's other sign is tried in the first waves, when the patch is small.
 IDLE_WAVES = 3
@@ -127,7 +133,7 @@ def _finished(scene: Scene, pose: Pose, match: Index) -> Embedding | None:
     if fit is None:
         return None
     prediction = _predict(scene, fit, match)
-    kept = _cleaned(scene, prediction, match, final=True)
+    kept = _trusted(scene, prediction, _cleaned(scene, prediction, match, final=True))
     whole = _extended(scene, prediction, kept, damaged=True)
     if (whole == match).all():
         return _embedding(scene, fit, match, prediction)
@@ -136,7 +142,7 @@ def _finished(scene: Scene, pose: Pose, match: Index) -> Embedding | None:
         return None
     prediction = _predict(scene, fit, whole)
     # what was let in must agree with its neighbours, and so must those that lost some
-    final = _cleaned(scene, prediction, whole, final=True)
+    final = _trusted(scene, prediction, _cleaned(scene, prediction, whole, final=True))
     if (final >= 0).sum() < FEWEST_MATCHES:
         return None
     return _embedding(scene, fit, final, _predict(scene, fit, final))
@@ -191,13 +197,21 @@ def _predict(scene: Scene, fit: RigidFit, match: Index) -> Prediction:
     scale = _root_det(affine)
     with np.errstate(invalid="ignore", divide="ignore"):
         rigid = (rigid_px < RIGID_SIGMA * scale * layout.spacing_mm) & (fit.sigma_px < 2 * RIGID_SIGMA * scale * layout.spacing_mm)
-        known = np.isfinite(predicted).all(axis=1) & ((support >= FEWEST_NEIGHBOURS) | rigid)
+        stiff = (fit.sigma_px < STIFF_PART * scale * layout.spacing_mm) & _within_reach(layout.center_mm, matched)
+        known = np.isfinite(predicted).all(axis=1) & ((support >= FEWEST_NEIGHBOURS) | (rigid & ((support > 0) | stiff)))
         size = scale * layout.radius_mm
         log_size = np.where(matched, np.log(candidates.size_px[match] / size), np.nan)
         in_plane = np.einsum("kij,kj->ki", invert_2x2(affine), candidates.center_px[match] - predicted)
     ratio = float(np.nanmedian(log_size)) if matched.any() else 0.0
     distance = np.where(matched, np.linalg.norm(in_plane, axis=1), np.nan)
     return Prediction(predicted, affine, support, distance, log_size - ratio, ratio, known)
+
+
+def _within_reach(places: Array, matched: Flags) -> Flags:
+    if not matched.any():
+        return matched
+    distance = np.linalg.norm(places - places[matched].mean(axis=0), axis=1)
+    return np.asarray(distance <= STIFF_REACH * distance[matched].max())
 
 
 def _root_det(matrices: Array) -> Array:
@@ -263,13 +277,44 @@ def _cleaned(scene: Scene, prediction: Prediction, match: Index, final: bool) ->
     return np.where((match >= 0) & ~lost, match, -1)
 
 
+def _trusted(scene: Scene, prediction: Prediction, match: Index) -> Index:
+    """Matches without those among more circles that look like marks and fit nowhere than circles that fit.
+
+    A part of the pattern that is matched one mark off has such circles all around it.
+    """
+    candidates = scene.candidates
+    seen = np.isfinite(prediction.predicted_px).all(axis=1)
+    spacing = np.where(seen, _root_det(np.nan_to_num(prediction.affine)) * scene.layout.spacing_mm, 0.0)
+    places = np.where(seen[:, None], prediction.predicted_px, 1e9)
+    distance, nearest = cKDTree(places).query(candidates.center_px)
+    expected_size = spacing[nearest] / scene.layout.spacing_mm[nearest] * scene.layout.radius_mm[nearest] * np.exp(prediction.log_ratio)
+    with np.errstate(divide="ignore"):
+        like = candidates.is_type.any(axis=1) & (np.abs(np.log(candidates.size_px / expected_size)) < np.log(1.3))
+    like &= distance < STRANGER_PART * spacing[nearest]
+    for _ in range(MOST_WAVES):
+        marks = np.flatnonzero(match >= 0)
+        strange = like.copy()
+        strange[match[marks]] = False
+        if not strange.any() or not len(marks):
+            break
+        places, radius = candidates.center_px[match[marks]], STRANGER_PART * spacing[marks]
+        strangers = cKDTree(candidates.center_px[strange]).query_ball_point(places, radius, return_length=True)
+        fitting = cKDTree(places).query_ball_point(places, radius, return_length=True) - 1
+        bad = strangers > np.maximum(fitting, 1)
+        if not bad.any():
+            break
+        match = match.copy()
+        match[marks[bad]] = -1
+    return match
+
+
 def _extended(scene: Scene, prediction: Prediction, match: Index, damaged: bool) -> Index:
     """Matches with those marks added that have a candidate where they should be."""
     layout, candidates = scene.layout, scene.candidates
     open_marks = np.flatnonzero((match < 0) & prediction.known)
     if not len(open_marks) or not len(candidates):
         return match
-    distance, nearest = scene.tree.query(prediction.predicted_px[open_marks])
+    _, nearest = scene.tree.query(prediction.predicted_px[open_marks])
     taken = np.isin(nearest, match[match >= 0])
     fits = candidates.may_be_type if damaged else candidates.is_type
     part = DAMAGED_GATE if damaged else 1.0
