@@ -23,7 +23,7 @@ ORDER = [
     # know nothing of cameras or dishes
     *("errors", "quality", "transforms", "robust"),
     # the camera
-    *("camera.model", "camera.undistort", "camera.chessboard", "camera.bundle", "camera.calibrate"),
+    *("camera.model", "camera.undistort", "camera.chessboard", "camera.bundle", "camera.calibrate", "camera.uncertainty"),
     # shapes in which deformations are spoken of
     *("surface.zernike",),
     # what is printed
@@ -31,8 +31,8 @@ ORDER = [
     # finding it
     *("targets.ellipses", "targets.detect", "targets.subpixel"),
     # naming it
-    *("targets.layout", "targets.rigid", "targets.candidates", "targets.growth", "targets.constellations", "targets.search"),
-    *("targets.rivals", "targets.identify"),
+    *("targets.layout", "targets.rigid", "targets.markgrid", "targets.candidates", "targets.growth", "targets.constellations"),
+    *("targets.beam", "targets.search", "targets.rivals", "targets.identify"),
     # measuring it in the raw pixels
     *("targets.edges", "targets.pixels", "targets.window", "targets.adjust", "targets.start", "targets.sensitivity"),
     *("targets.scene_noise", "targets.stages", "targets.pose"),

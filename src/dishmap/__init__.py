@@ -17,29 +17,34 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from dishmap.camera.calibrate import calibrate
+    from dishmap.camera.chessboard import find_boards
     from dishmap.camera.model import Camera
+    from dishmap.camera.undistort import undistort_image, undistort_points
     from dishmap.io.camera_file import read_camera, write_camera
     from dishmap.io.images import read_gray
     from dishmap.io.pattern_file import read_pattern, write_pattern
     from dishmap.pipeline import map_photograph
     from dishmap.simulate.deform import Deformation
     from dishmap.simulate.render import simulate as simulate_photograph
-    from dishmap.simulate.scene import Scene, Sensor, facing_pose
+    from dishmap.simulate.scene import Light, Scene, Sensor, facing_pose
     from dishmap.surface.cloud import PointCloud
-    from dishmap.surface.fit import fit_surface
+    from dishmap.surface.fit import Basis, fit_surface
     from dishmap.targets.builders import dish, plate
     from dishmap.targets.detect import find_ellipses
     from dishmap.targets.identify import PoseGuess, Upright, identify
     from dishmap.targets.pattern import Pattern, Surface, TargetKind
-    from dishmap.targets.pose import measure_targets
+    from dishmap.targets.pose import Assumptions, measure_targets
     from dishmap.transforms import Pose
 
     __version__: str
 
 # Where each public name lives; the imports above say the same to type checkers, and a test holds the two together.
 _HOME = {
+    "Assumptions": "dishmap.targets.pose",
+    "Basis": "dishmap.surface.fit",
     "Camera": "dishmap.camera.model",
     "Deformation": "dishmap.simulate.deform",
+    "Light": "dishmap.simulate.scene",
     "Pattern": "dishmap.targets.pattern",
     "PointCloud": "dishmap.surface.cloud",
     "Pose": "dishmap.transforms",
@@ -52,6 +57,7 @@ _HOME = {
     "calibrate": "dishmap.camera.calibrate",
     "dish": "dishmap.targets.builders",
     "facing_pose": "dishmap.simulate.scene",
+    "find_boards": "dishmap.camera.chessboard",
     "find_ellipses": "dishmap.targets.detect",
     "fit_surface": "dishmap.surface.fit",
     "identify": "dishmap.targets.identify",
@@ -62,16 +68,20 @@ _HOME = {
     "read_gray": "dishmap.io.images",
     "read_pattern": "dishmap.io.pattern_file",
     "simulate_photograph": "dishmap.simulate.render",
+    "undistort_image": "dishmap.camera.undistort",
+    "undistort_points": "dishmap.camera.undistort",
     "write_camera": "dishmap.io.camera_file",
     "write_pattern": "dishmap.io.pattern_file",
 }
-
 # `dishmap.simulate` is the package, so its function of that name goes by another one here.
 _OTHER_NAME = {"simulate_photograph": "simulate"}
 
 __all__ = [
+    "Assumptions",
+    "Basis",
     "Camera",
     "Deformation",
+    "Light",
     "Pattern",
     "PointCloud",
     "Pose",
@@ -85,6 +95,7 @@ __all__ = [
     "calibrate",
     "dish",
     "facing_pose",
+    "find_boards",
     "find_ellipses",
     "fit_surface",
     "identify",
@@ -95,6 +106,8 @@ __all__ = [
     "read_gray",
     "read_pattern",
     "simulate_photograph",
+    "undistort_image",
+    "undistort_points",
     "write_camera",
     "write_pattern",
 ]

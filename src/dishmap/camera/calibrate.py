@@ -207,6 +207,8 @@ def _without_outliers(
         bundle = Bundle(bundle.camera, bundle.rotation[keep], bundle.translation_mm[keep])
         corners = _joined(views)
         bundle = ba.adjust(bundle, corners, free, _prior(expected, bundle, corners), np.concatenate(used).astype(float))
+    # the prior is only as weak as the noise is small, and the noise is known now
+    bundle = ba.adjust(bundle, corners, free, _prior(expected, bundle, corners), np.concatenate(used).astype(float))
     return bundle, views, used, rejected
 
 
