@@ -33,14 +33,15 @@ if TYPE_CHECKING:
     from dishmap.targets.detect import find_ellipses
     from dishmap.targets.identify import PoseGuess, Upright, identify
     from dishmap.targets.pattern import Pattern, Surface, TargetKind
-    from dishmap.targets.pose import Assumptions, measure_targets
+    from dishmap.targets.pose import measure_targets
+    from dishmap.targets.stages import Assumptions
     from dishmap.transforms import Pose
 
     __version__: str
 
 # Where each public name lives; the imports above say the same to type checkers, and a test holds the two together.
 _HOME = {
-    "Assumptions": "dishmap.targets.pose",
+    "Assumptions": "dishmap.targets.stages",
     "Basis": "dishmap.surface.fit",
     "Camera": "dishmap.camera.model",
     "Deformation": "dishmap.simulate.deform",

@@ -239,7 +239,7 @@ def without(key: str) -> str:
         (without("image_height"), "it has no image_height"),
         (without("camera_matrix"), "it has no camera_matrix"),
         (without("distortion_coefficients"), "it has no distortion_coefficients"),
-        (GOOD.replace("image_width: 2304", "image_width: 2304.5"), "image_width must be a whole number of pixels up to 1000000, not 2304.5"),
+        (GOOD.replace("image_width: 2304", "image_width: 2304.5"), "must be a whole number of pixels up to 1000000, not 2304.5"),
         (GOOD.replace("image_width: 2304", "image_width: -3"), "image_width must be a whole number"),
         (GOOD.replace("image_width: 2304", "image_width: 1e300"), "image_width must be a whole number"),
         (GOOD.replace("image_width: 2304", "image_width: .Nan"), "image_width must be a whole number"),
@@ -253,8 +253,8 @@ def without(key: str) -> str:
         (GOOD.replace("1674.3", "-1674.3"), "focal length of -1674.3"),
         (GOOD.replace("1674.3", "zwölf"), "'zwölf' in camera_matrix is not a number"),
         (GOOD.replace("   rows: 3", "   rows: 4", 1), "camera_matrix says 4x3 but holds 9 numbers"),
-        (GOOD.replace("-0.0004, -0.009 ]", "-0.0004 ]").replace("cols: 5", "cols: 4").replace("k3", "k4"), "parameter_names must be fx, fy"),
-        (GOOD.replace("-0.0004, -0.009 ]", "-0.0004, -0.009, 1 ]").replace("cols: 5", "cols: 6"), "takes 0 or 4 or 5 or 8 or 12 coefficients"),
+        (GOOD.replace(", -0.009 ]", " ]").replace("cols: 5", "cols: 4").replace("k3", "k4"), "parameter_names must be fx, fy"),
+        (GOOD.replace(", -0.009 ]", ", -0.009, 1 ]").replace("cols: 5", "cols: 6"), "takes 0 or 4 or 5 or 8 or 12 coefficients"),
         (GOOD.replace("model: opencv", "model: omnidirectional"), "its model 'omnidirectional' is not modelled here; opencv, plumb_bob"),
         (GOOD.replace("model: opencv", "model: fisheye"), "fisheye lens model takes 4 coefficients, not 5"),
         (GOOD.replace("k3 ]", "k9 ]"), "parameter_names must be fx, fy, cx, cy, k1, k2, p1, p2, k3 for its covariance"),
@@ -311,7 +311,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x80\x00" * 10)
     with pytest.raises(CameraError, match="it is not text"):
         read_camera(tmp_path / "binary.yaml")
-    with pytest.raises(CameraError, match="it cannot be read|no such file"):
+    with pytest.raises(CameraError, match=r"it cannot be read|no such file"):
         read_camera("nul\0.yaml")
     with (tmp_path / "huge.yaml").open("wb") as stream:
         stream.truncate(200_000_000)

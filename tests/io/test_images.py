@@ -164,7 +164,7 @@ def test_truncated_files_are_refused(tmp_path: Path, name: str, part: float) -> 
     assert read_gray(saved(tmp_path, data)).shape == (HEIGHT, WIDTH)
     # two bytes less take the end mark of a JPEG; a TIFF may end with bytes that nothing points to
     keep = min(int(len(data) * part), len(data) - (12 if "tiff" in name else 2)) or 1
-    with pytest.raises(ImageError, match="cannot use .*photo as a photograph: ") as error:
+    with pytest.raises(ImageError, match=r"cannot use .*photo as a photograph: ") as error:
         read_gray(saved(tmp_path, data[:keep]))
     assert "\n" not in str(error.value)
 

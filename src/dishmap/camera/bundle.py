@@ -23,7 +23,7 @@ POSE = 6
 OPENCV_POWERS, FISHEYE_POWERS = (2, 4, 1, 1, 6, 2, 4, 6, 1, 3, 1, 3), (2, 4, 6, 8)
 STIFFNESS = 0.5
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-13, 1e12
-MOST_STEPS = 200
+MOST_STEPS = 100
 # A step that is expected to lower the sum of squares by less than this part of it changes no parameter by 1e-5 sigma.
 RELATIVE_GAIN = 1e-12
 # Below this rms the residuals are rounding errors of the projection.

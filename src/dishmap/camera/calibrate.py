@@ -35,7 +35,7 @@ FEWEST_VIEWS, FEWEST_CORNERS = 3, 12
 # A planar start needs a board that is flat to this part of its size.
 FLATNESS = 0.1
 # Focal lengths tried for the start, in units of the longer side: from 120 degrees across to a long lens.
-START_FOCAL = {"opencv": np.geomspace(0.3, 20.0, 18), "fisheye": np.geomspace(0.2, 3.0, 14)}
+START_FOCAL = {"opencv": np.geomspace(0.3, 20.0, 11), "fisheye": np.geomspace(0.2, 3.0, 8)}
 # A view is left out when its rms is this many times the median view's, or when so many of its corners are outliers.
 BAD_VIEW_RATIO, BAD_VIEW_OUTLIERS = 4.0, 0.25
 # A corner is an outlier beyond this many robust sigmas of its own view: Gaussian noise gets there once in 6e7 corners.

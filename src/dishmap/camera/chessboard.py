@@ -125,7 +125,8 @@ def _check_sides(lost: NDArray[np.bool_]) -> None:
     rows, columns = lost.shape
     if max(side.mean() for side in (lost[0], lost[-1], lost[:, 0], lost[:, -1])) > LARGEST_LOST_SIDE:
         raise MeasurementError(
-            f"no chessboard of {columns}x{rows} inner corners found: along one side no four squares meet; inner corners are counted, not squares"
+            f"no chessboard of {columns}x{rows} inner corners found: along one side no four squares meet; inner corners are counted, "
+            "not squares"
         )
 
 

@@ -24,7 +24,9 @@ LARGEST_TURN_RAD = 0.2
 NEW_FIELDS_RAD = 0.01
 SHARPEST_BLUR_PX, WIDEST_BLUR_PX = 0.3, 12.0
 # Converged when the next step would be under 6 % of the estimate's own sigma, or the step itself is under 2e-4 px.
-STEP_SIGMAS, STEP_PX, SETTLED_PX = 0.06, 2e-4, 0.1
+STEP_SIGMAS, STEP_PX, SETTLED_PX = 0.06, 2e-4, 0.3
+LEFT_BLURS = 6.0
+MOST_CONVERGED = 0.5
 # A turn about the normal is unknown for targets of one centre; this prior merely keeps it at zero.
 NO_TURN_SIGMA_RAD = 1e-4
 
@@ -104,36 +106,76 @@ def prior_terms(poses: Poses, state: State, priors: Priors) -> tuple[Array, Arra
 
 
 def adjust(batch: Batch, pixels: RingPixels, poses: Poses, state: State, weighting: Weighting, steps: int, enough: float = 1.0) -> Adjusted:
-    """Run up to `steps` Gauss-Newton steps from `poses` and `state`, until a share `enough` of the targets has converged."""
-    count = len(poses)
-    converged = np.zeros(count, bool)
+    """Run up to `steps` Gauss-Newton steps from `poses` and `state`, until a share `enough` of the targets has converged.
+
+    Once most targets have converged, the others go on alone.
+    """
     maps = batch.maps(poses, pixels.patches)
-    for step in range(steps):
-        sums, residual = ring_sums(pixels, batch.rings, maps, state, weighting)
-        freedom = np.maximum(by_target(sums.weight, pixels.target, count) - GEOMETRY, 1.0)
-        variance = np.maximum(by_target(sums.square, pixels.target, count) / freedom, 1e-12)
-        normal, right = without_light(sums)
-        data = by_target(normal, pixels.target, count) / variance[:, None, None]
-        precision, pull = prior_terms(poses, state, batch.priors)
-        information = data.copy()
-        information[:, range(GEOMETRY), range(GEOMETRY)] += precision
-        delta = solve_scaled(information, by_target(right, pixels.target, count) / variance[:, None] + pull)
-        sigmas = np.sqrt(np.maximum(np.einsum("tg,tgh,th->t", delta, information, delta) / GEOMETRY, 0))
-        move_px = _largest_motion_px(delta, maps, pixels.target, count)
-        # after a Gauss-Newton step of size x the next is about x^2 / blur: what is left is judged, not what was done
-        left = np.minimum(move_px / (2 * state.blur_px), 1.0)
-        converged = (sigmas * left < STEP_SIGMAS) & (move_px < SETTLED_PX) | (move_px < STEP_PX)
-        turn = np.linalg.norm(delta[:, 3:6], axis=1)
-        limit = np.minimum(1.0, np.minimum(LARGEST_STEP_PX / np.maximum(move_px, 1e-9), LARGEST_TURN_RAD / np.maximum(turn, 1e-9)))
-        poses, state = _moved(poses, state, delta * np.nan_to_num(limit)[:, None])
-        if converged.mean() >= enough or step == steps - 1:
-            # the last step was a small part of sigma: the sums before it serve as those after it
+    for step in range(1, steps + 1):
+        fit, turning = _one_step(batch, pixels, poses, state, weighting, maps)
+        poses, state = fit.poses, fit.state
+        share = fit.converged.mean()
+        # the last step was a small part of sigma: the sums before it serve as those after it
+        if share >= enough or step == steps:
             break
+        if share > MOST_CONVERGED:
+            return _with_rest(batch, pixels, fit, weighting, steps - step)
         # the motion fields only steer: they are made anew when targets turn, not at every step
-        turning = float(np.nan_to_num(turn).max(initial=0.0)) > NEW_FIELDS_RAD
         maps = batch.maps(poses, pixels.patches, None if turning else maps)
+    return fit
+
+
+def _one_step(batch: Batch, pixels: RingPixels, poses: Poses, state: State, weighting: Weighting, maps: LocalMaps) -> tuple[Adjusted, bool]:
+    """One pass over the pixels and one step; and whether some target turned enough to need new motion fields."""
+    count = len(poses)
+    sums, residual = ring_sums(pixels, batch.rings, maps, state, weighting)
+    freedom = np.maximum(by_target(sums.weight, pixels.target, count) - GEOMETRY, 1.0)
+    variance = np.maximum(by_target(sums.square, pixels.target, count) / freedom, 1e-12)
+    normal, right = without_light(sums)
+    data = by_target(normal, pixels.target, count) / variance[:, None, None]
+    precision, pull = prior_terms(poses, state, batch.priors)
+    information = data.copy()
+    information[:, range(GEOMETRY), range(GEOMETRY)] += precision
+    delta = solve_scaled(information, by_target(right, pixels.target, count) / variance[:, None] + pull)
+    sigmas = np.sqrt(np.maximum(np.einsum("tg,tgh,th->t", delta, information, delta) / GEOMETRY, 0))
+    move_px = _largest_motion_px(delta, maps, pixels.target, count)
+    # a Gauss-Newton step of x px leaves a few tenths of x^2 / blur to do: what is left is judged, not what was done
+    left = np.minimum(move_px / (LEFT_BLURS * state.blur_px), 1.0)
+    converged = ((sigmas * left < STEP_SIGMAS) & (move_px < SETTLED_PX)) | (move_px < STEP_PX)
+    turn = np.linalg.norm(delta[:, 3:6], axis=1)
+    limit = np.minimum(1.0, np.minimum(LARGEST_STEP_PX / np.maximum(move_px, 1e-9), LARGEST_TURN_RAD / np.maximum(turn, 1e-9)))
+    poses, state = _moved(poses, state, delta * np.nan_to_num(limit)[:, None])
     good = converged & np.isfinite(poses.position_mm).all(axis=1)
-    return Adjusted(poses, state, information, data, good, sums, residual, variance)
+    turning = float(np.nan_to_num(turn).max(initial=0.0)) > NEW_FIELDS_RAD
+    return Adjusted(poses, state, information, data, good, sums, residual, variance), turning
+
+
+def _with_rest(batch: Batch, pixels: RingPixels, fit: Adjusted, weighting: Weighting, steps: int) -> Adjusted:
+    """`fit` with the targets that have not converged adjusted further."""
+    rest = ~fit.converged
+    rings = rest[pixels.target]
+    number = np.cumsum(rest) - 1
+    priors = replace(batch.priors, normal=batch.priors.normal[rest], normal_sigma_rad=batch.priors.normal_sigma_rad[rest])
+    some = replace(batch, curvature_per_mm=batch.curvature_per_mm[rest], priors=priors)
+    cut = None if weighting.cut is None else weighting.cut[rings]
+    state = State(fit.state.offset_mm[rest], fit.state.offset_px[rest], fit.state.blur_px[rest])
+    more = adjust(some, pixels.only(rings, number), fit.poses.take(rest), state, replace(weighting, cut=cut), steps)
+
+    def merged(old: Array, new: Array, where: Array) -> Array:
+        out = old.copy()
+        out[where] = new
+        return out
+
+    return Adjusted(
+        Poses(merged(fit.poses.rotation, more.poses.rotation, rest), merged(fit.poses.position_mm, more.poses.position_mm, rest)),
+        State(*(merged(getattr(fit.state, f), getattr(more.state, f), rest) for f in State.__dataclass_fields__)),
+        merged(fit.information, more.information, rest),
+        merged(fit.data_information, more.data_information, rest),
+        merged(fit.converged, more.converged, rest),
+        RingSums(*(merged(getattr(fit.sums, f), getattr(more.sums, f), rings) for f in RingSums.__dataclass_fields__)),
+        merged(fit.residual, more.residual, rings),
+        merged(fit.noise_variance, more.noise_variance, rest),
+    )
 
 
 def solve_scaled(matrix: Array, right: Array) -> Array:

@@ -30,11 +30,12 @@ SAME_SHIFT, SAME_TURN_RAD = 0.3, 0.05
 
 @dataclass(frozen=True)
 class Ranked:
-    """A pose camera_from_dish with the marks and candidates it pairs."""
+    """A pose camera_from_dish, the marks and candidates that it pairs near the seed, and how many it pairs in all."""
 
     pose: Pose
     marks: Index
     candidates: Index
+    count: int
 
 
 def sort_out(scene: Scene, guesses: Hypotheses) -> list[Ranked]:
@@ -58,7 +59,7 @@ def sort_out(scene: Scene, guesses: Hypotheses) -> list[Ranked]:
         # far from the seed a bent surface may have led to the wrong marks: growth finds these anew
         hit = np.flatnonzero(mark[h, :SURE] >= 0)
         marks, first = np.unique(mark[h][hit], return_index=True)
-        ranked.append(Ranked(Pose(rotation[h], shift[h]), marks, near[hit[first]]))
+        ranked.append(Ranked(Pose(rotation[h], shift[h]), marks, near[hit[first]], int((mark[h] >= 0).sum())))
     return ranked
 
 
@@ -95,7 +96,7 @@ def _marks_met(scene: Scene, rotation: Array, shift: Array, near: Index) -> Inde
     origin = -(shift[:, None, :] @ rotation)
     ray = scene.candidates.ray[near] @ rotation
     t = meet_surface(scene.layout.surface, origin, ray)
-    mark = scene.grid.nearest(np.nan_to_num(origin + t[..., None] * ray, nan=1e9))
+    mark = scene.grid.nearest(origin + t[..., None] * ray)
     fits = scene.candidates.is_type[near[None, :], scene.layout.type_index[mark]]
     return np.where(fits, mark, -1)
 

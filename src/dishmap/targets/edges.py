@@ -73,6 +73,10 @@ class Poses:
         """Return the poses at `index`."""
         return Poses(self.rotation[index], self.position_mm[index])
 
+    def in_camera(self, local_mm: Array) -> Array:
+        """Points (T, Q, 3) of target axes in the camera frame."""
+        return self.position_mm[:, None] + local_mm @ np.swapaxes(self.rotation, 1, 2)
+
     @property
     def steps(self) -> Array:
         """Axes (T, 3, 3) for small moves: two columns across the line of sight, the third along it.
@@ -112,17 +116,13 @@ class LocalMaps:
     degree: int
 
 
-def _in_camera(poses: Poses, local: Array) -> Array:
-    return poses.position_mm[:, None] + local @ np.swapaxes(poses.rotation, 1, 2)
-
-
 def project_printed(camera: Camera, poses: Poses, curvature_per_mm: Array, xy_mm: Array) -> tuple[Array, Array]:
     """Pixels (T, Q, 2) of printed positions, and their derivative by the six pose parameters (T, Q, 2, 6).
 
     The parameters are three moves in mm along `poses.steps` and three turns in rad about the target's own axes.
     """
-    local = bent_print_mm(xy_mm, curvature_per_mm)
-    pixels, by_point = camera.project_with_point_jacobian(_in_camera(poses, local))
+    local = bent_print_mm(np.broadcast_to(xy_mm, (len(poses), *xy_mm.shape[-2:])), curvature_per_mm)
+    pixels, by_point = camera.project_with_point_jacobian(poses.in_camera(local))
     moves = by_point @ poses.steps[:, None]
     turns = by_point @ (poses.rotation[:, None] @ -cross_matrix(local))
     return pixels, np.concatenate([moves, turns], axis=-1)
@@ -156,7 +156,7 @@ def _basis(pixels: Array, patches: Patches, degree: int) -> Array:
 
 def _plane_maps(camera: Camera, poses: Poses, curvature: Array, patches: Patches, degree: int) -> tuple[Array, Array]:
     nodes = _nodes(patches, degree + 2)
-    basis = _basis(camera.project(_in_camera(poses, bent_print_mm(nodes, curvature))), patches, degree)
+    basis = _basis(camera.project(poses.in_camera(bent_print_mm(nodes, curvature))), patches, degree)
     lost = ~np.isfinite(basis).all(axis=(1, 2))
     basis[lost] = 0.0
     plane = _least_squares(basis, np.swapaxes(nodes, 1, 2))

@@ -26,16 +26,18 @@ from dishmap.transforms import Pose
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-# A placement beats another when it explains at least this many more observations (marks seen, or marks not contradicted): a
-# stray circle of the right size in the right place, once or twice, must not decide.
+# A placement beats another when it explains at least this many more observations (marks seen, or marks not contradicted), where
+# one that lies exactly in its place counts for more (rivals.EXACT_WEIGHT): a stray circle of the right size in the
+# right place must not decide.
 DECISIVE = 3
 # ... or when both explain the same, and the other leaves residuals this many times larger, over enough marks.
 DECISIVE_MISFIT, FEWEST_FOR_MISFIT = 3.0, 8
 # Rivals whose marks meet only roughly are grown in the image to see what they explain; so many at most.
 ROUGH_MISFIT, MOST_REGROWN = 0.04, 6
 MOST_CHANGES = 4
-# Rivals are listed up to this deficit; options that agree on this part of their marks are one.
-LISTED_DEFICIT = 12
+# Rivals that are looked at in full when they explain as much, and how many that do not are reported as ruled out; options that
+# agree on this part of their marks are one.
+MOST_OPTIONS, RULED_OUT_LISTED = 64, 3
 SAME_PART = 0.5
 # What the hints promise.
 UPRIGHT_RAD = np.radians(45.0)
@@ -169,11 +171,11 @@ def _options(scene: Scene, pattern: Pattern, placement: Embedding) -> list[_Opti
         placement = moved
     options = [_Option(scene, placement, placement.fit.pose, _pairs(placement), 0.0)]
     options += [_rough_option(scene, placement, other) for other in rough]
-    for h in order:
-        deficit = float(rivals.cost[h] - rivals.cost[0])
-        if deficit < LISTED_DEFICIT and (clean or not _is_rough(rivals, int(h))):
-            option = _exact_option(scene, placement, seen, rivals, int(h), deficit)
-            options += [option] if option is not None else []
+    exact = [int(h) for h in order if clean or not _is_rough(rivals, int(h))]
+    close = [h for h in exact if rivals.cost[h] - rivals.cost[0] < DECISIVE][:MOST_OPTIONS]
+    for h in close + [h for h in exact if h not in close][:RULED_OUT_LISTED]:
+        option = _exact_option(scene, placement, seen, rivals, h, float(rivals.cost[h] - rivals.cost[0]))
+        options += [option] if option is not None else []
     return _distinct(options, scene.layout)
 
 

@@ -12,6 +12,8 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 MOST_CELLS = 2_000_000
+# Farther than any pattern reaches.
+NOWHERE_MM = 1e7
 
 
 def meet_surface(surface: Surface, origin: Array, ray: Array) -> Array:
@@ -51,7 +53,8 @@ class MarkGrid:
             self.table[cells[good, 0] * self.shape[1] + cells[good, 1]] = np.flatnonzero(good)
 
     def nearest(self, places_mm: Array) -> Index:
-        """The mark within reach of each place (..., 3), or -1."""
+        """The mark within reach of each place (..., 3), or -1; also where a place is NaN."""
+        places_mm = np.nan_to_num(places_mm, nan=NOWHERE_MM).clip(-NOWHERE_MM, NOWHERE_MM)
         cells = np.floor((places_mm[..., :2] - self.low) / self.cell)
         inside = ((cells >= 0) & (cells < self.shape)).all(axis=-1)
         flat = np.where(inside, cells[..., 0] * self.shape[1] + cells[..., 1], 0).astype(np.int64)

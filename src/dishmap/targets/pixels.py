@@ -31,7 +31,7 @@ OFFSET_MM, OFFSET_PX, BLUR = 6, 7, 8
 # Light parameters of a ring: ground level and slopes, ink level and slopes (grey levels, and per local unit).
 LIGHT = 6
 # Half width of the band of pixels used, in blurs: beyond it the edge changes the pixel by under 0.2 % of the contrast.
-BAND_BLURS, BAND_EXTRA_PX = 2.7, 0.6
+BAND_BLURS, BAND_EXTRA_PX = 2.5, 0.5
 # Above this product of curvature and blur the series for curved edges leaves more than 0.001 px; see tests.
 LARGEST_CURVED = 0.22
 FINE_FACTOR, FINE_BLUR_PX = 3, 0.4
@@ -88,6 +88,12 @@ class RingPixels:
     def target(self) -> NDArray[np.int64]:
         """The target of each ring (M,)."""
         return self.patches.target
+
+    def only(self, rows: Bool, number: NDArray[np.int64]) -> RingPixels:
+        """The rings `rows` (M,), with targets renumbered by `number`."""
+        p = self.patches
+        patches = Patches(number[p.target[rows]], p.center_mm[rows], p.reach_mm[rows], p.anchor_px[rows], p.scale_px[rows])
+        return RingPixels(self.ring[rows], patches, self.s[rows], self.t[rows], self.grey[rows], self.used[rows], self.shape)
 
     def every(self, step: int) -> RingPixels:
         """Keep every `step`-th pixel, for the first coarse steps of a fit (bands only)."""

@@ -21,7 +21,7 @@ from dishmap.targets.identify import Identity
 from dishmap.targets.pattern import Pattern
 from dishmap.targets.pixels import GEOMETRY, OFFSET_MM, OFFSET_PX, RingPixels
 from dishmap.targets.scene_noise import NoiseModel, noise_model
-from dishmap.targets.sensitivity import calibration_jacobian, mirror_evidence
+from dishmap.targets.sensitivity import calibration_jacobian, mirror_evidence, mirrored_normals
 from dishmap.targets.stages import Assumptions, Group, Shared, coarse_fit, full_fit, learn, regroup, start_groups
 from dishmap.targets.start import centers_of
 from dishmap.targets.window import sharpest_curvature_per_px
@@ -177,7 +177,6 @@ def _results(image: NDArray[np.generic], group: Group, adjusted: Adjusted, pixel
     contrast = light[:, 0] - light[:, 3]
     sigma = np.sqrt(noise.variance(np.maximum(light[:, 0], 1.0)) * adjusted.noise_variance)
     edge_information = contrast**2 / (2 * np.sqrt(np.pi) * np.maximum(sigma, 1e-6) ** 2 * adjusted.state.blur_px * noise.inflation)
-    evidence, mirrored = mirror_evidence(batch, group.kind, poses, edge_information)
     columns = {
         "index": group.index,
         "position_mm": poses.position_mm,
@@ -194,7 +193,7 @@ def _results(image: NDArray[np.generic], group: Group, adjusted: Adjusted, pixel
         "noise": sigma,
         "kept": _kept(adjusted, pixels, count),
     }
-    columns["quality"] = _quality(image, group, adjusted, pixels, columns, data + prior, evidence, mirrored)
+    columns["quality"] = _quality(image, group, adjusted, pixels, columns, data + prior, edge_information)
     return columns
 
 
@@ -206,7 +205,7 @@ def _kept(adjusted: Adjusted, pixels: RingPixels, count: int) -> Array:
     return np.where(np.bincount(pixels.target[seen], minlength=count) > 0, out, 0.0)
 
 
-def _quality(image, group: Group, adjusted: Adjusted, pixels: RingPixels, columns: dict[str, Array], information: Array, evidence: Array, mirrored: Array) -> Index:
+def _quality(image, group: Group, adjusted: Adjusted, pixels: RingPixels, columns: dict[str, Array], information: Array, edge_information: Array) -> Index:
     count = len(group.index)
     bits = np.zeros(count, np.int64)
 
@@ -224,16 +223,26 @@ def _quality(image, group: Group, adjusted: Adjusted, pixels: RingPixels, column
     dropped = np.bincount(pixels.target[~pixels.used.any(axis=1)], minlength=count) > 0
     flag(lost & bright, Quality.GLARE)
     flag((lost & ~bright) | dropped, Quality.OCCLUDED)
-    priors = group.batch.priors
-    normal = columns["normal"]
-    prior = (angle_between_rad(mirrored, priors.normal) ** 2 - angle_between_rad(normal, priors.normal) ** 2) / priors.normal_sigma_rad**2
-    apart = angle_between_rad(normal, mirrored) > 2 * columns["sigma_normal_rad"]
-    flag((evidence + prior < MIRROR_CHI_SQUARE) & apart, Quality.AMBIGUOUS_NORMAL)
+    flag(_ambiguous(group, adjusted, columns, edge_information), Quality.AMBIGUOUS_NORMAL)
     known = [i for i in range(GEOMETRY) if i not in (OFFSET_MM, OFFSET_PX)]
     free = inverse_scaled(information)[:, 2, 2]
     fixed = inverse_scaled(information[:, known][:, :, known])[:, 2, 2]
     flag(free > WEAK_DEPTH_RATIO**2 * fixed, Quality.WEAK_DEPTH)
     return bits
+
+
+def _ambiguous(group: Group, adjusted: Adjusted, columns: dict[str, Array], edge_information: Array) -> Array:
+    """Where (T,) the mirrored normal is as likely, and far enough away to matter."""
+    batch, poses, normal = group.batch, adjusted.poses, columns["normal"]
+    mirrored, priors = mirrored_normals(poses), batch.priors
+    out = angle_between_rad(normal, mirrored) > 2 * columns["sigma_normal_rad"]
+    prior = (angle_between_rad(mirrored, priors.normal) ** 2 - angle_between_rad(normal, priors.normal) ** 2) / priors.normal_sigma_rad**2
+    # where the surface alone decides, the pixels need not be asked
+    out &= prior < MIRROR_CHI_SQUARE
+    if out.any():
+        some = replace(batch, curvature_per_mm=batch.curvature_per_mm[out])
+        out[out] = mirror_evidence(some, group.kind, poses.take(out), edge_information[out]) + prior[out] < MIRROR_CHI_SQUARE
+    return out
 
 
 def _lost_edges(image, adjusted: Adjusted, pixels: RingPixels, count: int) -> tuple[Array, Array]:

@@ -31,6 +31,8 @@ SAMPLE = 64
 FIRST_LOOK, FIRST_ROOM = 12, 0.1
 LEAST_EXPLAINED, LEAST_EXPLAINED_ROUGH = 0.3, 0.15
 LEFT_OVER_PART, LEFT_OVER = 0.1, 12
+# A match within this part of its radius, or these px, of where its neighbours put it has the greater weight.
+EXACT_RADIUS, EXACT_PX, EXACT_WEIGHT = 0.1, 0.7, 1.5
 # Sizes that differ by less than this (log) could be the same circle.
 SAME_LOG_SIZE = 0.2
 
@@ -124,8 +126,17 @@ def find_rivals(scene: Scene, placement: Embedding, seen: Observations) -> Rival
     square = np.where(hit, ((moved - layout.center_mm[mark]) ** 2).sum(axis=2), 0.0)
     misfit = np.sqrt(square.sum(axis=1) / np.maximum(hit.sum(axis=1), 1)) / layout.spacing_mm.min()
     # an observation that is no mark counts, and once more where a mark should be that looks different
-    cost = (~hit).sum(axis=1) + (~hit & (met >= 0)).sum(axis=1).astype(float)
+    cost = (~hit * _weights(placement, layout, seen)).sum(axis=1) + (~hit & (met >= 0)).sum(axis=1)
     return Rivals(rotation, shift, mark, cost, misfit)
+
+
+def _weights(placement: Embedding, layout: Layout, seen: Observations) -> Array:
+    """Weight (n,) of each observation: more for matches so close to their place that no stray circle lies there by chance."""
+    residual = np.where(seen.mark >= 0, placement.prediction.residual_mm[seen.mark], np.inf)
+    scale = np.sqrt(np.abs(np.linalg.det(np.nan_to_num(placement.prediction.affine[seen.mark]))))
+    limit = np.maximum(EXACT_RADIUS * layout.radius_mm[seen.mark], EXACT_PX / np.maximum(scale, 1e-9))
+    with np.errstate(invalid="ignore"):
+        return np.where(residual < limit, EXACT_WEIGHT, 1.0)
 
 
 def _anchors(layout: Layout, marks: Index) -> Index:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -33,6 +34,11 @@ ENOUGH = 0.5
 # A placement that is not clean may be a wrong one, bent to fit: it ends the search only when so many were found.
 ENOUGH_BENT = 3
 ABOUT_EQUAL = 3
+# A start is grown when it explains this part of what is asked for, before any bending is allowed for.
+RIGID_COUNT_PART = 0.4
+# A placement is no find when circles strewn at random would give one as good more often than this.
+LARGEST_LOG10_CHANCE = -3.0
+SMALLEST_REACH_PX, TURNS_TRIED = 0.5, 8
 
 
 def scene_of(candidates: Candidates, layout: Layout, camera: Camera) -> Scene:
@@ -55,9 +61,11 @@ def find_placement(scene: Scene, least: int) -> Embedding | None:
     grown, enough = 0, 0
     for guesses in _clearest_first(scene):
         for start in sort_out(scene, guesses):
+            if start.count < RIGID_COUNT_PART * least:
+                continue
             placement = grow(scene, start.pose, start.marks, start.candidates)
             grown += 1
-            if placement is None:
+            if placement is None or placement.count < least or log10_chance(scene, placement) > LARGEST_LOG10_CHANCE:
                 continue
             if best is None or worth(placement) > worth(best):
                 best = placement
@@ -67,7 +75,29 @@ def find_placement(scene: Scene, least: int) -> Embedding | None:
                 return best
         if grown >= MOST_GROWN or enough >= ENOUGH_BENT:
             break
-    return best if best is not None and best.count >= least else None
+    return best
+
+
+def log10_chance(scene: Scene, placement: Embedding) -> float:
+    """Logarithm of the number of placements as good that circles strewn at random would give.
+
+    Each mark in view finds one of N circles of density d within the largest residual r with probability p = pi r^2 d;
+    three matches define the placement, and N circles times K marks times some turns are tried.
+    """
+    marks = np.flatnonzero(placement.candidate >= 0)
+    predicted = placement.prediction.predicted_px
+    inside = scene.camera.contains(predicted)
+    inside[marks] = True
+    n, m = len(marks), int(inside.sum())
+    low, high = predicted[inside].min(axis=0), predicted[inside].max(axis=0)
+    center = scene.candidates.center_px[scene.candidates.is_type.any(axis=1)]
+    near = int(((center >= low - 1) & (center <= high + 1)).all(axis=1).sum())
+    # the residual in px: that in mm times the scale of the map
+    scale = np.sqrt(np.abs(np.linalg.det(placement.prediction.affine[marks])))
+    reach = max(float((np.nan_to_num(placement.prediction.residual_mm[marks]) * scale).max()), SMALLEST_REACH_PX)
+    p = min(0.5, np.pi * reach**2 * max(near, 1) / float(np.prod(np.maximum(high - low, 1.0))))
+    choices = (math.lgamma(m + 1) - math.lgamma(n + 1) - math.lgamma(m - n + 1)) / math.log(10)
+    return math.log10(len(center) * len(scene.layout) * TURNS_TRIED) + choices + (n - 3) * math.log10(p)
 
 
 def worth(placement: Embedding) -> tuple[int, float]:

@@ -39,8 +39,8 @@ def calibration_jacobian(batch: Batch, kind: TargetKind, poses: Poses, edge_info
     """
     xy, _ = _outline_samples(kind)
     pixels, motion = project_printed(batch.camera, poses, batch.curvature_per_mm, xy)
-    local = bent_print_mm(xy, batch.curvature_per_mm)
-    points = poses.position_mm[:, None] + np.einsum("tij,tqj->tqi", poses.rotation, local)
+    local = bent_print_mm(np.broadcast_to(xy, (len(poses), *xy.shape)), batch.curvature_per_mm)
+    points = poses.in_camera(local)
     _, _, by_camera = batch.camera.project_with_jacobians(points)
     normals, length = _edge_normals(pixels, kind)
     pose_columns = np.einsum("tqk,tqkp->tqp", normals, motion)
@@ -53,15 +53,19 @@ def calibration_jacobian(batch: Batch, kind: TargetKind, poses: Poses, edge_info
     return poses.steps @ change[:, :3]
 
 
-def mirror_evidence(batch: Batch, kind: TargetKind, poses: Poses, edge_information: Array) -> tuple[Array, Array]:
-    """Rise of chi-square (T,) that pixels would show at the mirrored pose, and the mirrored normals (T, 3).
+def mirrored_normals(poses: Poses) -> Array:
+    """Normals (T, 3) mirrored about the lines of sight.
 
-    Under weak perspective a plane and its mirror image about the line of sight look alike (Schweighofer and Pinz 2006);
-    what tells them apart is the little perspective within the target.
+    Under weak perspective a plane and its mirror image about the line of sight look alike (Schweighofer and Pinz 2006).
     """
     ray = poses.position_mm / np.linalg.norm(poses.position_mm, axis=1, keepdims=True)
     normal = poses.rotation[..., 2]
-    mirrored = 2 * (normal * ray).sum(axis=1, keepdims=True) * ray - normal
+    return 2 * (normal * ray).sum(axis=1, keepdims=True) * ray - normal
+
+
+def mirror_evidence(batch: Batch, kind: TargetKind, poses: Poses, edge_information: Array) -> Array:
+    """Rise of chi-square (T,) that pixels would show at the mirrored pose: the little perspective within the target."""
+    normal, mirrored = poses.rotation[..., 2], mirrored_normals(poses)
     axis = np.cross(normal, mirrored)
     sine = np.linalg.norm(axis, axis=1, keepdims=True)
     angle = np.arctan2(sine, (normal * mirrored).sum(axis=1, keepdims=True))
@@ -84,4 +88,4 @@ def mirror_evidence(batch: Batch, kind: TargetKind, poses: Poses, edge_informati
         other = Poses(other.rotation @ rotation_from_vector(delta[:, 3:]), position)
     pixels, _ = project_printed(batch.camera, other, batch.curvature_per_mm, xy)
     gap = np.einsum("tqk,tqk->tq", normals, seen - pixels)
-    return (weight * gap * gap).sum(axis=1), other.rotation[..., 2]
+    return (weight * gap * gap).sum(axis=1)

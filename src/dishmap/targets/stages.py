@@ -27,7 +27,7 @@ Bool = NDArray[np.bool_]
 FIRST_BLUR_PX, FIRST_LOG_BLUR_SIGMA = 0.9, 1.0
 FIRST_BAND_BLUR_PX = 1.5
 FIRST_NORMAL_SIGMA_RAD = np.radians(12.0)
-COARSE_STRIDE = 4
+COARSE_PIXELS = 1200
 FIRST_STEPS, COARSE_STEPS, FULL_STEPS = 3, 8, 8
 COARSE_ENOUGH = 0.9
 # Targets in one group: bounds memory, and keeps the windows of a group about equally large.
@@ -185,7 +185,8 @@ def layout(image: NDArray[np.generic], group: Group, blur_px: float, band_blur_p
 def coarse_fit(image: NDArray[np.generic], group: Group) -> Coarse:
     """Fit every fourth pixel of a wide band, first all of them, then without outliers."""
     batch, pixels = layout(image, group, FIRST_BLUR_PX, FIRST_BAND_BLUR_PX)
-    pixels = pixels.every(COARSE_STRIDE)
+    # one pixel of each block of 2x2, and fewer blocks of large rings
+    pixels = pixels.every(4 * max(1, pixels.s.shape[1] // COARSE_PIXELS))
     first = adjust(batch, pixels, group.poses, group.state, Weighting(1.0, 0.0, None), FIRST_STEPS)
     cut = residual_cut(first, pixels)
     second = adjust(batch, pixels, first.poses, first.state, Weighting(1.0, 0.0, cut), COARSE_STEPS, COARSE_ENOUGH)

@@ -21,7 +21,7 @@ ELLIPSE_POINTS = 12
 # What a detected ellipse is good for, shared over its points: its errors are common to all of them.
 ELLIPSE_SIGMA_PX = 0.25 * ELLIPSE_POINTS**0.5
 ELLIPSE_CUT_PX = 2.5
-ELLIPSE_STEPS = 5
+ELLIPSE_STEPS = 4
 RIGID_STEPS = 10
 
 
@@ -56,20 +56,20 @@ def pair_circles(kind: TargetKind, outer_circle: Index, detection: Index, parent
 
     outer_circle, detection (K,): matched outermost circles and their ellipses; parent (M,): the detections' nesting.
     """
-    size = np.sqrt(semi_axes_px.prod(axis=1))
+    size = np.sqrt(semi_axes_px.prod(axis=1)).tolist()
     children: dict[int, list[int]] = {}
-    for inner in np.flatnonzero(parent >= 0):
-        children.setdefault(int(parent[inner]), []).append(int(inner))
+    for inner in np.flatnonzero(parent >= 0).tolist():
+        children.setdefault(int(parent[inner]), []).append(inner)
+    nested = {int(c): np.flatnonzero((kind.outermost == c) & (kind.parent >= 0)).tolist() for c in np.flatnonzero(kind.parent < 0)}
+    radius = kind.radius_mm.tolist()
     rows = []
-    for match, (circle, ellipse) in enumerate(zip(outer_circle, detection, strict=True)):
-        rows.append((match, int(circle), int(ellipse)))
-        nested = np.flatnonzero((kind.outermost == circle) & (kind.parent >= 0))
-        inside = [c for e in children.get(int(ellipse), []) for c in (e, *children.get(e, []))]
-        for inner in inside:
+    for match, (circle, ellipse) in enumerate(zip(outer_circle.tolist(), detection.tolist(), strict=True)):
+        rows.append((match, circle, ellipse))
+        for inner in [c for e in children.get(ellipse, []) for c in (e, *children.get(e, []))]:
             ratio = size[inner] / size[ellipse]
-            fit = np.abs(kind.radius_mm[nested] / kind.radius_mm[circle] - ratio)
-            if len(nested) and fit.min() < 0.15 * ratio:
-                rows.append((match, int(nested[np.argmin(fit)]), inner))
+            nearest = min(nested[circle], key=lambda n: abs(radius[n] / radius[circle] - ratio), default=None)
+            if nearest is not None and abs(radius[nearest] / radius[circle] - ratio) < 0.15 * ratio:
+                rows.append((match, nearest, inner))
     return rows
 
 

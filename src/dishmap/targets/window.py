@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.camera.model import Camera
-from dishmap.targets.edges import LocalMaps, Patches, Poses, monomials, project_printed
-from dishmap.targets.pattern import TargetKind
+from dishmap.targets.edges import LocalMaps, Patches, Poses, monomials
+from dishmap.targets.pattern import TargetKind, bent_print_mm
 from dishmap.targets.pixels import BAND_BLURS, BAND_EXTRA_PX, LARGEST_CURVED, RingPixels, Rings, rings_of
 
 Array = NDArray[np.float64]
@@ -25,7 +25,8 @@ def outline(camera: Camera, poses: Poses, curvature_per_mm: Array, center_mm: Ar
     angle = 2 * np.pi * np.arange(OUTLINE_POINTS) / OUTLINE_POINTS
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     xy = center_mm[:, None] + radius_mm[:, None, None] * circle
-    pixels, _ = project_printed(camera, poses, curvature_per_mm, xy.reshape(-1, 2))
+    local = bent_print_mm(np.broadcast_to(xy.reshape(-1, 2), (len(poses), xy.size // 2, 2)), curvature_per_mm)
+    pixels = camera.project(poses.in_camera(local))
     return pixels.reshape(len(poses), len(radius_mm), OUTLINE_POINTS, 2)
 
 

@@ -1,0 +1,1 @@
+"""Pictures as SVG text: maps over the dish, the marked photograph, charts of a calibration."""

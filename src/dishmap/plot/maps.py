@@ -1,0 +1,141 @@
+"""Charts of what was measured, over the dish as seen from its focus: x to the right, y up, millimetres."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.tri import Triangulation
+from numpy.typing import NDArray
+
+from dishmap.plot.canvas import BLUE, DIVERGING, FAINT, INK, ORANGE, RED, SEQUENTIAL, Array, as_svg, color_norm, new_figure, round_length
+
+MAP_IN = (6.2, 5.2)
+CHART_IN = (6.2, 4.4)
+LEVELS = 20
+# Names beside points stay readable up to so many.
+MOST_NAMES = 12
+# An arrow of the longest kind takes this part of the map's width; those of the strays beyond this quantile may be longer.
+LONGEST_ARROW, ARROW_QUANTILE = 0.12, 0.95
+# Beyond this factor the spread found is drawn beside the one claimed.
+SPREAD_WORTH_DRAWING = 1.5
+# Bins of a histogram hold on average so many points, within limits.
+POINTS_PER_BIN, FEWEST_BINS, MOST_BINS = 6, 8, 40
+
+
+@as_svg
+def residual_map(xy_mm: Array, residual_mm: Array, off: NDArray[np.bool_], ids: NDArray[np.int64], label: str) -> Figure:
+    """Residuals (N,) to the surface at points (N, 2), on a scale that is symmetric about zero; points off the surface as crosses."""
+    figure, axes = new_figure(*MAP_IN)
+    on = ~off
+    largest = float(np.abs(residual_mm[on]).max()) if on.any() else 0.0
+    largest = largest or float(np.abs(residual_mm).max()) or 1.0
+    norm = Normalize(-largest, largest)
+    _fill(axes, xy_mm[on], residual_mm[on], norm, DIVERGING)
+    dots = axes.scatter(*xy_mm[on].T, c=residual_mm[on], cmap=DIVERGING, norm=norm, s=26, edgecolors=INK, linewidths=0.6, zorder=3)
+    if off.any():
+        axes.scatter(*xy_mm[off].T, marker="X", s=60, c=ORANGE, edgecolors=INK, linewidths=0.6, zorder=4, label="off the surface")
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderpad=0.0)
+        if off.sum() <= MOST_NAMES:
+            _name(axes, xy_mm[off], ids[off])
+    figure.colorbar(dots, ax=axes, label=label, shrink=0.9)
+    _dish_axes(axes, xy_mm)
+    return figure
+
+
+@as_svg
+def sigma_map(xy_mm: Array, sigma: Array, label: str) -> Figure:
+    """Sigmas (N,) at points (N, 2), filled between them."""
+    figure, axes = new_figure(*MAP_IN)
+    norm = color_norm(sigma)
+    _fill(axes, xy_mm, sigma, norm, SEQUENTIAL)
+    dots = axes.scatter(*xy_mm.T, c=sigma, cmap=SEQUENTIAL, norm=norm, s=26, edgecolors=INK, linewidths=0.6, zorder=3)
+    figure.colorbar(dots, ax=axes, label=label, shrink=0.9)
+    _dish_axes(axes, xy_mm)
+    return figure
+
+
+@as_svg
+def normals_map(xy_mm: Array, lean_rad: Array, reference: str) -> Figure:
+    """Arrows at points (N, 2) showing how far, and to which side, normals lean from a reference: lean_rad (N, 2)."""
+    figure, axes = new_figure(*MAP_IN)
+    lean_deg = np.degrees(lean_rad)
+    length_deg = np.hypot(*lean_deg.T)
+    typical = float(np.quantile(length_deg, ARROW_QUANTILE)) or float(length_deg.max()) or 1.0
+    span = _span(xy_mm)
+    scale = typical / (LONGEST_ARROW * span)
+    axes.scatter(*xy_mm.T, s=7, c=FAINT, zorder=2)
+    arrows = axes.quiver(
+        *xy_mm.T, *lean_deg.T, angles="xy", scale_units="xy", scale=scale, color=BLUE, width=0.004, headwidth=4, headlength=4.5, zorder=3
+    )
+    key = round_length(typical)
+    axes.quiverkey(arrows, 0.02, 1.04, key, f"{key:g}° from the {reference}", labelpos="E", coordinates="axes", color=BLUE)
+    _dish_axes(axes, xy_mm)
+    return figure
+
+
+@as_svg
+def ratio_histogram(ratio: Array, spread: float) -> Figure:
+    """Histogram of residual over claimed sigma (N,) with the normal curve that true sigmas would give.
+
+    spread: the robust spread of the ratio; where it is far from one, the normal curve of that spread is drawn too.
+    """
+    figure, axes = new_figure(*CHART_IN)
+    reach = max(4.0, 1.15 * float(np.abs(ratio).max()))
+    if spread > 0:
+        reach = min(reach, max(4.0, 6.0 * spread))
+    bins = int(np.clip(len(ratio) // POINTS_PER_BIN, FEWEST_BINS, MOST_BINS))
+    inside = np.clip(ratio, -reach, reach)
+    density, *_ = axes.hist(inside, bins=bins, range=(-reach, reach), density=True, color="#a6cee3", edgecolor="#4d7ea8", linewidth=0.6)
+    x = np.linspace(-reach, reach, 801)
+    axes.plot(x, _normal_curve(x, 1.0), color=INK, label="if the claimed sigmas are all there is")
+    highest = float(np.max(density))
+    if spread > SPREAD_WORTH_DRAWING:
+        axes.plot(x, _normal_curve(x, spread), color=ORANGE, linestyle="--", label=f"{spread:.3g} times wider")
+        highest = max(highest, float(_normal_curve(np.zeros(1), spread)[0]))
+    else:
+        highest = max(highest, 0.4)
+    axes.set(xlabel="residual / claimed sigma", ylabel="share of targets per unit", xlim=(-reach, reach), ylim=(0.0, 1.35 * highest))
+    axes.legend(loc="upper left")
+    return figure
+
+
+def _normal_curve(x: Array, spread: float) -> Array:
+    return np.asarray(np.exp(-0.5 * (x / spread) ** 2) / (spread * np.sqrt(2 * np.pi)))
+
+
+def _span(xy_mm: Array) -> float:
+    return float(np.ptp(xy_mm, axis=0).max()) or 1.0
+
+
+def _fill(axes: Axes, xy_mm: Array, values: Array, norm: Normalize, colors: str) -> None:
+    """Filled contours, linear between neighbouring points; nothing where the points span no area."""
+    triangles = _triangulation(xy_mm)
+    if triangles is None or not np.ptp(values) > 0:
+        return
+    levels = norm.inverse(np.linspace(0.0, 1.0, LEVELS + 1))
+    # rounding must not leave the extreme points outside the outermost levels
+    levels[0], levels[-1] = min(levels[0], values.min()), max(levels[-1], values.max())
+    filled = axes.tricontourf(triangles, values, levels=levels, cmap=colors, norm=norm, alpha=0.85, zorder=1)
+    filled.set_edgecolor("face")
+
+
+def _triangulation(xy_mm: Array) -> Triangulation | None:
+    """Delaunay triangles without the needles along the rim; None where points lie on one line or are too few."""
+    if len(xy_mm) < 3 or np.linalg.matrix_rank(xy_mm - xy_mm.mean(axis=0), tol=1e-6 * _span(xy_mm)) < 2:
+        return None
+    return Triangulation(*xy_mm.T)
+
+
+def _name(axes: Axes, xy_mm: Array, ids: NDArray[np.int64]) -> None:
+    for (x, y), ident in zip(xy_mm, ids, strict=True):
+        axes.annotate(str(ident), (x, y), xytext=(6, 6), textcoords="offset points", color=RED, fontsize=10, zorder=5)
+
+
+def _dish_axes(axes: Axes, xy_mm: Array) -> None:
+    """Equal scales, a margin around the points, and units."""
+    low, high = xy_mm.min(axis=0), xy_mm.max(axis=0)
+    margin = 0.08 * _span(xy_mm)
+    axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), xlabel="x (mm)", ylabel="y (mm)")
+    axes.set_aspect("equal", adjustable="box")

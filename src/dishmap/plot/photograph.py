@@ -1,0 +1,190 @@
+"""The photograph with what was found drawn over it, and the map of expected projection error (the paper's Fig. 1), as SVG.
+
+The picture is 1600 units wide or 1200 high, whichever is reached first, whatever the photograph's size, so lines and letters keep theirs.
+"""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from html import escape
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dishmap.camera.uncertainty import ProjectionError
+from dishmap.plot.canvas import BLUE, FAINT, INK, RED, Array, color_norm, hex_colors, round_length
+
+BOX = (1600.0, 1200.0)
+JPEG_QUALITY = 82
+LEGEND_HEIGHT = 76.0
+PICTURE_ID = "photograph"
+# Letters between these sizes; where targets stand too close for the smaller, ids show on hovering only.
+SMALLEST_TEXT, LARGEST_TEXT = 8.0, 26.0
+# Width of a digit over its height, and the part of a target's spacing that its id may take.
+DIGIT_WIDTH, TEXT_PART = 0.6, 0.75
+WHITE_PERCENTILE = 99.5
+# The largest circle of expected error takes this part of the spacing of the grid.
+CIRCLE_PART = 0.48
+
+
+@dataclass(frozen=True)
+class Outline:
+    """Ellipses (K, 3, 2) of one target, each as its centre and the ends of two conjugate radii, in pixels of the photograph.
+
+    label: the text at `label_px`; title: what hovering tells; sigma: for the colour, NaN when unknown; state: `good`,
+    `rejected` or `missing`.
+    """
+
+    ellipses_px: Array
+    label_px: Array
+    label: str
+    title: str
+    sigma: float
+    state: str
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The picture's place in the SVG: units per pixel, width and height in units."""
+
+    scale: float
+    width: float
+    height: float
+
+    def place(self, pixels: Array) -> Array:
+        """Units of pixels (..., 2); the corner of the top-left pixel is (0, 0)."""
+        return np.asarray((pixels + 0.5) * self.scale)
+
+
+def frame_of(width_px: int, height_px: int) -> Frame:
+    """The frame of a photograph of this size."""
+    scale = min(BOX[0] / width_px, BOX[1] / height_px)
+    return Frame(scale, scale * width_px, scale * height_px)
+
+
+def photograph_svg(image: NDArray[np.generic], outlines: list[Outline], sigma_label: str, alt: str) -> str:
+    """The photograph (H, W) with outlined targets; colours by sigma where known, with their scale below.
+
+    Its picture has the id `photograph`, so that other SVGs of the same page can show it again.
+    """
+    frame = frame_of(image.shape[1], image.shape[0])
+    sigma = np.array([o.sigma for o in outlines if o.state == "good"])
+    known = sigma[np.isfinite(sigma)]
+    norm = color_norm(known)
+    text = _text_size(frame, outlines)
+    body = [
+        f'<image id="{PICTURE_ID}" width="{frame.width:.1f}" height="{frame.height:.1f}" preserveAspectRatio="none" href="{_jpeg(image, frame)}"/>'
+    ]
+    for outline in outlines:
+        color = hex_colors([outline.sigma], norm)[0] if np.isfinite(outline.sigma) else BLUE
+        body.append(_outline(frame, outline, color, text))
+    legend = _legend(frame, norm.vmin, norm.vmax, norm.inverse, sigma_label) if known.size else ""
+    return _svg(frame, LEGEND_HEIGHT if known.size else 0.0, alt, [*body, legend])
+
+
+def error_svg(error: ProjectionError, width_px: int, height_px: int, alt: str, with_picture: bool) -> str:
+    """Circles whose radius is the expected projection error, over the faded photograph if the page shows it elsewhere."""
+    frame = frame_of(width_px, height_px)
+    sigma, at = error.sigma_px.ravel(), frame.place(error.pixels.reshape(-1, 2))
+    spacing = min(frame.height / error.pixels.shape[0], frame.width / error.pixels.shape[1])
+    largest = float(np.nanmax(sigma))
+    units_per_px = CIRCLE_PART * spacing / largest if largest > 0 else 1.0
+    back = f'<rect width="{frame.width:.1f}" height="{frame.height:.1f}" fill="#ffffff" stroke="{FAINT}"/>'
+    if with_picture:
+        back += f'<use href="#{PICTURE_ID}" opacity="0.45"/>'
+    circles = [
+        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{max(s * units_per_px, 0.5):.1f}"><title>{s:.3g} px</title></circle>'
+        for (x, y), s in zip(at.tolist(), sigma.tolist(), strict=True)
+        if np.isfinite(s)
+    ]
+    marks = f'<g fill="none" stroke="#ffffff" stroke-width="5" opacity="0.7">{"".join(circles)}</g>' if with_picture else ""
+    marks += f'<g fill="{BLUE}" fill-opacity="0.15" stroke="{BLUE}" stroke-width="2.2">{"".join(circles)}</g>'
+    key = round_length(largest) if largest > 0 else 0.0
+    radius, middle = key * units_per_px, frame.height + LEGEND_HEIGHT / 2
+    legend = (
+        f'<circle cx="{radius + 6:.1f}" cy="{middle:.1f}" r="{radius:.1f}" fill="none" stroke="{BLUE}" stroke-width="2.2"/>'
+        f'<text x="{2 * radius + 18:.1f}" y="{middle + 8:.1f}" font-size="24" fill="{INK}">this radius is an expected error of {key:g} px</text>'
+    )
+    return _svg(frame, LEGEND_HEIGHT, alt, [back, marks, legend])
+
+
+def _svg(frame: Frame, below: float, alt: str, body: list[str]) -> str:
+    height = frame.height + below
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" class="picture" role="img" aria-label="{escape(alt)}" viewBox="0 0 {frame.width:.1f} {height:.1f}" '
+        f'style="width:{100 * frame.width / BOX[0]:.1f}%" font-family="sans-serif">{"".join(body)}</svg>'
+    )
+
+
+def _jpeg(image: NDArray[np.generic], frame: Frame) -> str:
+    """The photograph as a JPEG data URI, reduced to the frame's size, never enlarged."""
+    gray = np.asarray(image)
+    if frame.scale < 1:
+        size = (max(1, round(frame.width)), max(1, round(frame.height)))
+        gray = cv2.resize(gray if gray.dtype in (np.uint8, np.uint16) else gray.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    if gray.dtype != np.uint8:
+        white = float(np.percentile(gray, WHITE_PERCENTILE)) or 1.0
+        gray = np.clip(gray.astype(np.float32) * (255.0 / white), 0, 255).astype(np.uint8)
+    _, data = cv2.imencode(".jpg", gray, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
+
+
+def _text_size(frame: Frame, outlines: list[Outline]) -> float:
+    """Size of letters at which neighbouring ids do not touch; 0 where that is too small to read."""
+    named = [o for o in outlines if o.label]
+    if not named:
+        return 0.0
+    digits = max(len(o.label) for o in named)
+    at = frame.place(np.array([o.label_px for o in named]))
+    spacing = LARGEST_TEXT * digits
+    if len(at) > 1:
+        from scipy.spatial import cKDTree
+
+        nearest, _ = cKDTree(at).query(at, k=2)
+        spacing = float(np.quantile(nearest[:, 1], 0.02))
+    size = TEXT_PART * spacing / (DIGIT_WIDTH * max(digits, 2))
+    return 0.0 if size < SMALLEST_TEXT else min(size, LARGEST_TEXT)
+
+
+def _outline(frame: Frame, outline: Outline, color: str, text: float) -> str:
+    color = {"good": color, "rejected": "#e31a1c", "missing": "#ffffff"}[outline.state]
+    dash = "" if outline.state == "good" else ' stroke-dasharray="7 4"'
+    rings = []
+    for ellipse in frame.place(outline.ellipses_px).tolist():
+        (x, y), (ax, ay), (bx, by) = ellipse
+        matrix = f"matrix({ax - x:.2f} {ay - y:.2f} {bx - x:.2f} {by - y:.2f} {x:.1f} {y:.1f})"
+        rings.append(f'<circle r="1" transform="{matrix}" vector-effect="non-scaling-stroke"/>')
+    circles = "".join(rings)
+    # a dark line under the coloured one keeps it visible on ink and on ground
+    lines = f'<g fill="none" stroke="#000000" stroke-width="3.6">{circles}</g><g fill="none" stroke="{color}" stroke-width="2.2"{dash}>{circles}</g>'
+    (x, y), name = frame.place(outline.label_px).tolist(), ""
+    if outline.state == "rejected":
+        lines += f'<path d="M{x - 9:.1f} {y - 9:.1f}l18 18m0 -18l-18 18" stroke="#e31a1c" stroke-width="3.5"/>'
+        text, y = max(text, 16.0), y - 12 - 0.4 * max(text, 16.0)
+    if outline.label and text:
+        fill = RED if outline.state == "rejected" else INK
+        name = (
+            f'<text x="{x:.1f}" y="{y + 0.36 * text:.1f}" font-size="{text:.1f}" text-anchor="middle" fill="{fill}" '
+            f'stroke="#ffffff" stroke-width="{0.2 * text:.1f}" stroke-linejoin="round" paint-order="stroke">{escape(outline.label)}</text>'
+        )
+    return f"<g><title>{escape(outline.title)}</title>{lines}{name}</g>"
+
+
+def _legend(frame: Frame, low: float | None, high: float | None, inverse: object, label: str) -> str:
+    """A strip of colours with five values under it."""
+    assert low is not None and high is not None and callable(inverse)
+    norm = color_norm([low, high])
+    parts, width, top = [], 520.0, frame.height + 12
+    steps = 52
+    colors = hex_colors(inverse((np.arange(steps) + 0.5) / steps), norm)
+    parts = [
+        f'<rect x="{i * width / steps + 20:.1f}" y="{top:.1f}" width="{width / steps + 0.5:.1f}" height="20" fill="{color}"/>'
+        for i, color in enumerate(colors)
+    ]
+    for part in (0.0, 0.5, 1.0):
+        value = float(inverse(part))
+        parts.append(f'<text x="{20 + part * width:.1f}" y="{top + 48:.1f}" font-size="22" text-anchor="middle" fill="{INK}">{value:.3g}</text>')
+    parts.append(f'<text x="{width + 60:.1f}" y="{top + 18:.1f}" font-size="24" fill="{INK}">{escape(label)}</text>')
+    return "".join(parts)
