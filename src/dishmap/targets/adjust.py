@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from dishmap.camera.model import Camera
 from dishmap.targets.edges import LocalMaps, Patches, Poses, local_maps
-from dishmap.targets.pixels import BLUR, GEOMETRY, OFFSET_MM, OFFSET_PX, RingPixels, Rings, RingSums, State, Weighting, ring_sums, without_light
+from dishmap.targets.pixels import BLUR, GEOMETRY, OFFSET_MM, OFFSET_PX, TONE, RingPixels, Rings, RingSums, State, Weighting, ring_sums, without_light
 from dishmap.transforms import rotation_from_vector
 
 Array = NDArray[np.float64]
@@ -23,6 +23,7 @@ LARGEST_STEP_PX = 1.5
 LARGEST_TURN_RAD = 0.2
 NEW_FIELDS_RAD = 0.01
 SHARPEST_BLUR_PX, WIDEST_BLUR_PX = 0.3, 12.0
+STRONGEST_LOG_GAMMA = 1.2
 # Converged when the next step would be under 6 % of the estimate's own sigma, or the step itself is under 2e-4 px.
 STEP_SIGMAS, STEP_PX, SETTLED_PX = 0.06, 2e-4, 0.3
 LEFT_BLURS = 6.0
@@ -36,7 +37,7 @@ class Priors:
     """What is assumed of each target before its pixels are seen; sigma values, all broadcast to (T,).
 
     normal (T, 3): expected normal in the camera frame, towards the camera; normal_sigma_rad (T,); offset_mm_sigma (ink spread),
-    offset_px_sigma (tone curve of the camera), blur_px and log_blur_sigma; turns_freely: the kind has one centre.
+    offset_px_sigma (blooming), blur_px and log_blur_sigma, log_gamma (tone curve) and its sigma; turns_freely: the kind has one centre.
     """
 
     normal: Array
@@ -45,6 +46,8 @@ class Priors:
     offset_px_sigma: float
     blur_px: float
     log_blur_sigma: float
+    log_gamma: float
+    log_gamma_sigma: float
     turns_freely: bool
 
 
@@ -99,6 +102,7 @@ def prior_terms(poses: Poses, state: State, priors: Priors) -> tuple[Array, Arra
         (OFFSET_MM, state.offset_mm, 0.0, priors.offset_mm_sigma),
         (OFFSET_PX, state.offset_px, 0.0, priors.offset_px_sigma),
         (BLUR, state.blur_px, priors.blur_px, priors.log_blur_sigma * priors.blur_px),
+        (TONE, state.log_gamma, priors.log_gamma, priors.log_gamma_sigma),
     ):
         precision[:, column] = sigma**-2
         pull[:, column] = mean - value
@@ -158,8 +162,7 @@ def _with_rest(batch: Batch, pixels: RingPixels, fit: Adjusted, weighting: Weigh
     priors = replace(batch.priors, normal=batch.priors.normal[rest], normal_sigma_rad=batch.priors.normal_sigma_rad[rest])
     some = replace(batch, curvature_per_mm=batch.curvature_per_mm[rest], priors=priors)
     cut = None if weighting.cut is None else weighting.cut[rings]
-    state = State(fit.state.offset_mm[rest], fit.state.offset_px[rest], fit.state.blur_px[rest])
-    more = adjust(some, pixels.only(rings, number), fit.poses.take(rest), state, replace(weighting, cut=cut), steps)
+    more = adjust(some, pixels.only(rings, number), fit.poses.take(rest), fit.state.take(rest), replace(weighting, cut=cut), steps)
 
     def merged(old: Array, new: Array, where: Array) -> Array:
         out = old.copy()
@@ -213,5 +216,5 @@ def _moved(poses: Poses, state: State, delta: Array) -> tuple[Poses, State]:
     position = poses.position_mm + np.einsum("tij,tj->ti", poses.steps, delta[:, :3])
     rotation = poses.rotation @ rotation_from_vector(delta[:, 3:6])
     blur = np.clip(state.blur_px * np.exp(np.clip(delta[:, BLUR] / state.blur_px, -0.5, 0.5)), SHARPEST_BLUR_PX, WIDEST_BLUR_PX)
-    moved = replace(state, offset_mm=state.offset_mm + delta[:, OFFSET_MM], offset_px=state.offset_px + delta[:, OFFSET_PX], blur_px=blur)
-    return Poses(rotation, position), moved
+    tone = np.clip(state.log_gamma + delta[:, TONE], -STRONGEST_LOG_GAMMA, STRONGEST_LOG_GAMMA)
+    return Poses(rotation, position), State(state.offset_mm + delta[:, OFFSET_MM], state.offset_px + delta[:, OFFSET_PX], blur, tone)

@@ -18,14 +18,16 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 # Neighbours of the seed looked at in each stage, and hypotheses kept after it.
-STAGES = ((12, 120), (40, 30), (120, 8), (400, 3))
+STAGES = ((12, 100), (40, 25), (120, 6), (400, 3))
 STEPS = 2
+HANDED_ON = 3
 # Neighbours of the seed whose matches are handed on.
 SURE = 30
 # Residuals well above this part of the spacing of marks have little weight.
 SOFT_PART = 0.1
-# Poses closer than this to one another (parts of the spacing at the seed, rad) are one.
-SAME_SHIFT, SAME_TURN_RAD = 0.3, 0.05
+# Poses that put the seed on the same mark and are turned alike to this step are one; weights that make a number of the key.
+SAME_TURN_RAD = 0.05
+KEY_WEIGHTS = np.array([1e8, 1.0, 1e2, 1e4, 1e6])
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,8 @@ def sort_out(scene: Scene, guesses: Hypotheses) -> list[Ranked]:
     usable = np.flatnonzero(candidates.is_type.any(axis=1))
     order = usable[np.argsort(-(candidates.ray[usable] @ candidates.ray[guesses.seed]), kind="stable")]
     rotation, shift = seed_poses(candidates, layout, guesses)
+    if not len(order) or order[0] != guesses.seed:
+        order = np.append(guesses.seed, order[order != guesses.seed])
     for count, kept in STAGES:
         near = order[:count]
         for _ in range(STEPS):
@@ -55,7 +59,7 @@ def sort_out(scene: Scene, guesses: Hypotheses) -> list[Ranked]:
         if count >= len(order):
             break
     ranked = []
-    for h in range(len(rotation)):
+    for h in range(min(len(rotation), HANDED_ON)):
         # far from the seed a bent surface may have led to the wrong marks: growth finds these anew
         hit = np.flatnonzero(mark[h, :SURE] >= 0)
         marks, first = np.unique(mark[h][hit], return_index=True)
@@ -143,14 +147,7 @@ def _best(scene: Scene, rotation: Array, shift: Array, near: Index, mark: Index,
     """The poses that explain most candidates, near ones exactly, without repetitions, best first."""
     _, weight, _, _ = _residual(scene, rotation, shift, near, mark)
     order = np.argsort(-weight.sum(axis=1), kind="stable")
-    middle = scene.layout.center_mm[mark[:, 0]]
-    chosen: list[int] = []
-    for h in order:
-        if chosen:
-            close = np.linalg.norm(middle[chosen] - middle[h], axis=1) < SAME_SHIFT * scene.layout.spacing_mm.min()
-            if (close & (np.abs(rotation[chosen] - rotation[h]).max(axis=(1, 2)) < SAME_TURN_RAD)).any():
-                continue
-        chosen.append(int(h))
-        if len(chosen) == kept:
-            break
-    return np.array(chosen)
+    # the two tilts of one hypothesis often come to the same pose; a pair split by rounding does no harm
+    key = np.column_stack([mark[:, 0], np.round(rotation[:, :2, :2].reshape(-1, 4) / SAME_TURN_RAD)])[order]
+    _, first = np.unique(key @ KEY_WEIGHTS, return_index=True)
+    return np.asarray(order[np.sort(first)[:kept]])

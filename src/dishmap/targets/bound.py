@@ -73,9 +73,11 @@ def target_bound(
         assumptions.tone_shift_px,
         blur,
         FIRST_LOG_BLUR_SIGMA,
+        0.0,
+        1.0,
         kind.turns_freely,
     )
-    state = State(np.zeros(count), np.zeros(count), np.full(count, blur))
+    state = State(np.zeros(count), np.zeros(count), np.full(count, blur), np.zeros(count))
     group = Group(kind, np.arange(count), poses, Batch(camera, curvature, rings_of(kind), priors), state)
     information = _information(group, blur) * contrast_to_noise**2
     precision, _ = prior_terms(poses, state, priors)

@@ -30,7 +30,7 @@ CENTER_TOLERANCE = 0.35
 SIZE_TOLERANCE = 0.3
 FEWEST_VOTES = 3
 # The best of the hypotheses that agree about as well are kept.
-KEPT_PER_SEED = 400
+KEPT_PER_SEED, MOST_SORTED = 400, 1200
 
 
 @dataclass(frozen=True)
@@ -76,27 +76,12 @@ def match_neighbourhood(candidates: Candidates, seed: int, near: Index, layout: 
     if not len(row):
         return none
     votes, misfit = _vote(q, w, fits, row, turn)
-    good = votes >= max(FEWEST_VOTES - 1, int(0.4 * len(q)))
+    good = votes >= max(min(FEWEST_VOTES, len(q)), int(0.4 * len(q)))
     order = np.lexsort((misfit[good], -votes[good]))
     row, turn, votes, misfit = (values[good][order] for values in (row, turn, votes, misfit))
+    row, turn, votes, misfit = row[:MOST_SORTED], turn[:MOST_SORTED], votes[:MOST_SORTED], misfit[:MOST_SORTED]
     first = _distinct(marks[row], turn)[:KEPT_PER_SEED]
     return Hypotheses(seed, marks[row][first], np.angle(turn[first]).astype(float), votes[first], misfit[first])
-
-
-def matched_neighbours(candidates: Candidates, near: Index, layout: Layout, guess: Hypotheses, number: int) -> tuple[Index, Index]:
-    """Marks (n,) and candidates (n,) that hypothesis `number` pairs, the seed first."""
-    q, near = _whitened(candidates, guess.seed, near)
-    mark = guess.mark[number]
-    neighbour = layout.neighbour[mark]
-    printed = layout.offset_mm[mark] / layout.radius_mm[mark]
-    w = (printed[:, 0] - 1j * printed[:, 1]) * np.exp(1j * guess.turn_rad[number])
-    fits = candidates.is_type[near][:, layout.type_index[neighbour]] & (neighbour >= 0)
-    distance = np.where(fits, np.abs(q[:, None] - w), np.inf)
-    best = distance.argmin(axis=1)
-    hit = distance.min(axis=1) < _tolerance(np.abs(q))
-    # two candidates for one mark: neither is taken
-    unique = np.bincount(best[hit], minlength=len(w))[best] == 1
-    return np.append(mark, neighbour[best[hit & unique]]), np.append(guess.seed, near[hit & unique])
 
 
 def _whitened(candidates: Candidates, seed: int, near: Index) -> tuple[Complex, Index]:
@@ -136,14 +121,14 @@ def _vote(q: Complex, w: Complex, fits: NDArray[np.bool_], row: Index, turn: Com
         hit = square < 1
         votes[alive] += hit
         misfit[alive] += np.where(hit, square, 0.0)
-        # the anchor and two more of the nearest six must agree
-        if k == 5:
-            alive = alive[votes[alive] >= FEWEST_VOTES - 1]
+        # the anchor and one more of the nearest four, and another one of the nearest six, must agree
+        if k in (3, 5):
+            alive = alive[votes[alive] >= FEWEST_VOTES - 1 + (k > 3)]
     return votes, misfit / np.maximum(votes, 1)
 
 
 def _distinct(mark: Index, turn: Complex) -> Index:
     """Indices of the first of each group of equal marks and turns within ten degrees."""
     step = np.round(np.angle(turn) / np.radians(10.0)).astype(np.int64)
-    _, first = np.unique(np.stack([mark, step % 36]), axis=1, return_index=True)
+    _, first = np.unique(mark * 36 + step % 36, return_index=True)
     return np.sort(first)

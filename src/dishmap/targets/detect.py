@@ -53,22 +53,6 @@ RMS_PX, RMS_PART = 0.12, 0.03
 AREA_TOLERANCE = 0.2
 # Two finds are the same circle when the centres agree to this many px of the coarser one and the sizes to this part.
 SAME_CENTER_PX, SAME_SIZE = 1.5, 0.1
-# Spacing of the samples of darkest and lightest pixels that `Ground` keeps.
-GROUND_STEP = 8
-
-
-@dataclass(frozen=True)
-class Ground:
-    """Darkest and lightest grey level around points of a coarse grid, to see where the ground is blank.
-
-    darkest, lightest (h, w): within about half a step of the point; point (row, column) stands at full-resolution pixel
-    `origin_px + step_px * (column, row)`.
-    """
-
-    darkest: NDArray[np.float32]
-    lightest: NDArray[np.float32]
-    origin_px: float
-    step_px: float
 
 
 @dataclass(frozen=True)
@@ -78,7 +62,7 @@ class Detections:
     center_px (M, 2); semi_axes_px (M, 2), major first; angle_rad (M,) of the major axis from +u towards +v; dark (M,): the
     inside is darker; parent (M,): index of the smallest ellipse around each, or -1; contrast (M,) between inside and
     outside at the edge, grey levels; residual_px (M,): rms distance of the contour to the ellipse. Ellipses that the
-    border of the image cuts are not listed. ground: where the image is blank, if known.
+    border of the image cuts are not listed.
     """
 
     center_px: Array
@@ -88,7 +72,6 @@ class Detections:
     parent: NDArray[np.int64]
     contrast: Array
     residual_px: Array
-    ground: Ground | None = None
 
     def __len__(self) -> int:
         return len(self.center_px)
@@ -108,15 +91,14 @@ def find_ellipses(gray: NDArray[Any], full_resolution: bool = False) -> Detectio
     base = 2 if halve else 1
     image = _reduced(gray, base, white)
     noise = _noise(image)
-    found, ground, small = _search(image, base, noise)
+    found, small = _search(image, base, noise)
     if halve and _too_coarse(found, base, small):
-        found, ground, _ = _search(_reduced(gray, 1, white), 1, noise * 2)
-        base = 1
+        found, _ = _search(_reduced(gray, 1, white), 1, noise * 2)
     if min(image.shape) >= 16 * SECOND_REDUCTION:
         second = 2 * SECOND_REDUCTION if halve else SECOND_REDUCTION
-        coarse, _, _ = _search(_reduced(image, SECOND_REDUCTION, 255.0), second, noise / SECOND_REDUCTION)
+        coarse, _ = _search(_reduced(image, SECOND_REDUCTION, 255.0), second, noise / SECOND_REDUCTION)
         found = _merged(found, coarse)
-    return _detections(found, ground, white / 255.0)
+    return _detections(found, white / 255.0)
 
 
 @dataclass(frozen=True)
@@ -162,25 +144,24 @@ def _noise(image: Image) -> float:
     return float(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0))
 
 
-def _search(image: Image, reduction: int, noise: float) -> tuple[_Found, Ground, int]:
+def _search(image: Image, reduction: int, noise: float) -> tuple[_Found, int]:
     """All ellipses of one image; also how many small blobs its contours hold."""
     if noise > SMOOTH_ABOVE_NOISE:
         image, noise = cv2.GaussianBlur(image, (3, 3), 0), noise / 2.5
-    threshold, ink, ground = _binarise(image, max(LEAST_CONTRAST, LEAST_CONTRAST_SIGMAS * noise), reduction)
+    threshold, ink = _binarise(image, max(LEAST_CONTRAST, LEAST_CONTRAST_SIGMAS * noise))
     contours, _ = cv2.findContours(ink, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     del ink
     small = sum(1 for c in contours if 4 <= len(c) < FEWEST_POINTS)
     contours = [c for c in contours if len(c) >= FEWEST_POINTS]
     if not contours:
-        return _nothing(), ground, small
-    return _ellipses(image, threshold, contours, reduction), ground, small
+        return _nothing(), small
+    return _ellipses(image, threshold, contours, reduction), small
 
 
-def _binarise(image: Image, least_contrast: float, reduction: int) -> tuple[Image, Image, Ground]:
-    """Threshold of each pixel, where the image is ink (255), and the coarse map of its ground."""
+def _binarise(image: Image, least_contrast: float) -> tuple[Image, Image]:
+    """Threshold of each pixel, and where the image is ink (255)."""
     threshold, ink = np.empty_like(image), np.empty_like(image)
     kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * WINDOW_PX + 1, 2 * WINDOW_PX + 1))
-    darkest, lightest = [], []
     for top, bottom in _bands(len(image)):
         first, last = max(0, top - WINDOW_PX), min(len(image), bottom + WINDOW_PX)
         inner = slice(top - first, bottom - first)
@@ -190,10 +171,7 @@ def _binarise(image: Image, least_contrast: float, reduction: int) -> tuple[Imag
         limit = cv2.max(cv2.convertScaleAbs(high, alpha=LEAST_RELATIVE_CONTRAST), least_contrast)
         edges = cv2.compare(cv2.subtract(high, low), limit, cv2.CMP_GT)
         cv2.bitwise_and(cv2.compare(image[top:bottom], threshold[top:bottom], cv2.CMP_LT), edges, dst=ink[top:bottom])
-        darkest.append(low[::GROUND_STEP, ::GROUND_STEP].astype(np.float32))
-        lightest.append(high[::GROUND_STEP, ::GROUND_STEP].astype(np.float32))
-    ground = Ground(np.concatenate(darkest), np.concatenate(lightest), (reduction - 1) / 2, float(GROUND_STEP * reduction))
-    return threshold, ink, ground
+    return threshold, ink
 
 
 def _bands(rows: int) -> Iterator[tuple[int, int]]:
@@ -312,8 +290,7 @@ def _nothing() -> _Found:
     return _Found(np.zeros((0, 2)), np.zeros((0, 2)), none, np.zeros(0, dtype=bool), none, none, none)
 
 
-def _detections(found: _Found, ground: Ground, grey_levels: float) -> Detections:
-    scaled = Ground(ground.darkest * np.float32(grey_levels), ground.lightest * np.float32(grey_levels), ground.origin_px, ground.step_px)
+def _detections(found: _Found, grey_levels: float) -> Detections:
     parent = enclosing(found.center, found.semi_axes, found.angle)
     contrast = found.contrast * grey_levels
-    return Detections(found.center, found.semi_axes, found.angle, found.dark, parent, contrast, found.residual, scaled)
+    return Detections(found.center, found.semi_axes, found.angle, found.dark, parent, contrast, found.residual)

@@ -156,6 +156,8 @@ def _embedding(scene: Scene, fit: RigidFit, match: Index, prediction: Prediction
 def misfit_of(scene: Scene, pose: Pose, marks: Index, candidates: Index) -> float:
     """Robust sigma (px) of what neither a pose nor bending along the normal explains in a match."""
     layout = scene.layout
+    few = slice(None, None, 1 + len(marks) // MOST_POSE_MARKS)
+    marks, candidates = marks[few], candidates[few]
     points = layout.center_mm[marks]
     bend = BEND_PART * float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
     return unbent_misfit(pose, points, layout.axes[marks, :, 2], scene.candidates.sights.take(candidates), bend)

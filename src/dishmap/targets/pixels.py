@@ -5,7 +5,7 @@ Each outermost circle with what is nested in it is one ring here. Its pixels fol
     I(u, v) = ground(u, v) (1 - c) + ink(u, v) c,   c = sum over circles of +-Phi(d / s)
 
 with planar ground and ink levels of each ring, d the signed distance to the projected circle and s the total blur
-(s^2 = psf^2 + 1/12 for the pixel's own area). Curved edges: averaging Phi((d - k t^2 / 2) / s) over the blur along the edge
+(s^2 = psf^2 + 1/12 for the pixel's own area). A camera's tone curve, level = light^(1 / gamma), bends c (`toned`). Curved edges: averaging Phi((d - k t^2 / 2) / s) over the blur along the edge
 (curvature k) shifts the edge by k s^2 / 2 (1 + 3/4 k^2 s^2) and widens it by k^2 s^4 / 2. Where k s is too large for that
 series the ring is computed on a finer grid with little blur and then blurred exactly (`_fine_columns`).
 """
@@ -25,9 +25,9 @@ Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 Bool = NDArray[np.bool_]
 
-# Geometry parameters of a target: 3 moves (mm), 3 turns (rad), edge offset (mm), edge offset (px), blur s (px).
-GEOMETRY = 9
-OFFSET_MM, OFFSET_PX, BLUR = 6, 7, 8
+# Geometry parameters of a target: 3 moves (mm), 3 turns (rad), edge offset (mm), edge offset (px), blur s (px), log gamma.
+GEOMETRY = 10
+OFFSET_MM, OFFSET_PX, BLUR, TONE = 6, 7, 8, 9
 # Light parameters of a ring: ground level and slopes, ink level and slopes (grey levels, and per local unit).
 LIGHT = 6
 # Half width of the band of pixels used, in blurs: beyond it the edge changes the pixel by under 0.2 % of the contrast.
@@ -38,6 +38,8 @@ FINE_FACTOR, FINE_BLUR_PX = 3, 0.4
 # Pixels handled at once, so that the working arrays stay in the processor's cache.
 PIXELS_AT_ONCE = 24000
 TINY = np.float32(1e-6)
+# Ink over ground, as far as a tone curve is followed.
+TONE_RATIOS = (0.02, 0.95)
 
 
 @dataclass(frozen=True)
@@ -106,11 +108,17 @@ class RingPixels:
 
 @dataclass(frozen=True)
 class State:
-    """Nuisances of T targets that the geometry needs: offset_mm, offset_px (ink moved outwards), blur_px, each (T,)."""
+    """Nuisances of T targets that the geometry needs, each (T,): offset_mm and offset_px (ink moved outwards), blur_px, and
+    log_gamma of the tone curve."""
 
     offset_mm: Array
     offset_px: Array
     blur_px: Array
+    log_gamma: Array
+
+    def take(self, index: NDArray[np.int64] | Bool) -> State:
+        """The nuisances of the targets at `index`."""
+        return State(self.offset_mm[index], self.offset_px[index], self.blur_px[index], self.log_gamma[index])
 
 
 @dataclass(frozen=True)
@@ -262,6 +270,23 @@ def _blur_matrix(size: int, fine: int, first: int, extra: Array) -> tuple[Single
     return kernel.astype(np.float32), (kernel * (z2 - 1) / extra[:, None, None]).astype(np.float32)
 
 
+def toned(cover: Single, dark_over_light: Single, log_gamma: Single) -> tuple[Single, Single, Single]:
+    """Coverage (M, n) as a tone curve shows it, its derivative by the true coverage, and by log gamma.
+
+    With levels G of the ground and K of the ink, light adds as G^gamma (1 - c) + K^gamma c; the level recorded is the 1/gamma
+    power of that, and lies the returned part of the way from G to K. dark_over_light (M, 1) is K / G.
+    """
+    gamma = np.exp(log_gamma)
+    power = dark_over_light**gamma
+    light = 1 - (1 - power) * cover
+    log_light = np.log(light)
+    level = np.exp(log_light / gamma)
+    scale = 1 / (1 - dark_over_light)
+    slope = level / light * ((1 - power) * scale / gamma)
+    by_gamma = (log_light / gamma - power * np.log(dark_over_light) * cover / light) * level * scale
+    return (1 - level) * scale, slope, by_gamma
+
+
 def light_columns(s: Single, t: Single, cover: Single) -> Single:
     """Derivative of the pixels by the ring's light levels (M, L, n): ground and ink, each level and two slopes."""
     out = np.empty((len(cover), LIGHT, cover.shape[1]), np.float32)
@@ -303,6 +328,11 @@ def _sums(rows: slice, pixels: RingPixels, rings: Rings, maps: LocalMaps, state:
     cover, geometry, edges = coverage_columns(rows, pixels, rings, maps, state)
     used, grey = pixels.used[rows].astype(np.float32), pixels.grey[rows]
     columns = light_columns(pixels.s[rows], pixels.t[rows], cover)
+    light, model = _levels(columns, grey, used)
+    ratio = np.clip(light[:, 3:4] / np.maximum(light[:, :1], 1e-6), *TONE_RATIOS).astype(np.float32)
+    bent, slope, geometry[:, TONE] = toned(np.clip(cover, 0, 1), ratio, state.log_gamma[pixels.target[rows], None].astype(np.float32))
+    geometry[:, :TONE] *= slope[:, None]
+    columns = light_columns(pixels.s[rows], pixels.t[rows], bent)
     light, model = _levels(columns, grey, used)
     robust = used
     if weighting.cut is not None:

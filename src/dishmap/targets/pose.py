@@ -74,6 +74,7 @@ class TargetPoses:
     camera_from_dish: Pose
     normal_sigma_rad: float
     noise_model: NoiseModel
+    log_gamma: float
     rejected: tuple[tuple[int, str], ...]
 
     def __len__(self) -> int:
@@ -156,6 +157,7 @@ def _collect(
         camera_from_dish=shared.camera_from_dish,
         normal_sigma_rad=shared.normal_sigma_rad,
         noise_model=noise,
+        log_gamma=shared.log_gamma,
         rejected=tuple(sorted(rejected)),
         **kept,
     )

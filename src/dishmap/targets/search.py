@@ -26,6 +26,7 @@ MEETS = 0.25
 MOST_SEEDS = 30
 # Seeds looked at before any ambiguous one is grown; a clear one has a single hypothesis with so many votes.
 FIRST_SEEDS, CLEAR_VOTES = 3, 6
+FEWEST_SORTED = 12
 # Hypotheses agree about as well as the best when their misfit is below this many times the best one plus this much.
 CLEAR_MISFIT = (4.0, 0.002)
 MOST_GROWN = 36
@@ -115,13 +116,19 @@ def _clearest_first(scene: Scene) -> Iterator[Hypotheses]:
         if not len(guesses.mark):
             continue
         if number >= FIRST_SEEDS or (guesses.votes[0] >= CLEAR_VOTES and _equally_good(guesses) == 1):
-            yield guesses
+            yield _clear_ones(guesses)
             continue
         first.append(guesses)
         if number == FIRST_SEEDS - 1:
             yield from sorted(first, key=_ambiguity)
             first = []
     yield from sorted(first, key=_ambiguity)
+
+
+def _clear_ones(guesses: Hypotheses) -> Hypotheses:
+    """The hypotheses that agree best; all of them when many do."""
+    few = slice(0, max(2 * _equally_good(guesses), FEWEST_SORTED))
+    return Hypotheses(guesses.seed, guesses.mark[few], guesses.turn_rad[few], guesses.votes[few], guesses.misfit[few])
 
 
 def _ambiguity(guesses: Hypotheses) -> tuple[int, int]:

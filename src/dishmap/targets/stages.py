@@ -13,7 +13,7 @@ from dishmap.targets.detect import Detections
 from dishmap.targets.edges import Poses
 from dishmap.targets.identify import Identity
 from dishmap.targets.pattern import Pattern, TargetKind
-from dishmap.targets.pixels import RingPixels, State, Weighting, rings_of
+from dishmap.targets.pixels import TONE, RingPixels, State, Weighting, rings_of
 from dishmap.targets.scene_noise import ROBUST_TO_SIGMA, NoiseModel, noise_model
 from dishmap.targets.start import EllipsePoints, centers_of, ellipse_points, fit_ellipses, nominal_poses, pair_circles, rigid_pose
 from dishmap.targets.window import outline, patches_around, ring_areas, ring_layout, ring_pixels
@@ -26,6 +26,9 @@ Bool = NDArray[np.bool_]
 # First guesses, wide enough for any sharp photograph.
 FIRST_BLUR_PX, FIRST_LOG_BLUR_SIGMA = 0.9, 1.0
 FIRST_BAND_BLUR_PX = 1.5
+# Tone curves from gamma 0.4 to 2.7 lie within two of these.
+FIRST_LOG_GAMMA_SIGMA = 0.5
+LEAST_LOG_GAMMA_SIGMA = 1e-3
 FIRST_NORMAL_SIGMA_RAD = np.radians(12.0)
 COARSE_PIXELS = 1200
 FIRST_STEPS, COARSE_STEPS, FULL_STEPS = 3, 8, 8
@@ -82,11 +85,13 @@ class Coarse:
 
 @dataclass(frozen=True)
 class Shared:
-    """What all targets of the photograph share: rigid pose, noise, normal sigma."""
+    """What all targets of the photograph share: rigid pose, noise, spread of normals, tone curve (log gamma and its sigma)."""
 
     camera_from_dish: Pose
     noise: NoiseModel
     normal_sigma_rad: float
+    log_gamma: float
+    log_gamma_sigma: float
 
 
 def start_groups(
@@ -118,8 +123,7 @@ def regroup(group: Group, keep: Bool) -> Group:
     priors = group.batch.priors
     priors = replace(priors, normal=priors.normal[keep], normal_sigma_rad=priors.normal_sigma_rad[keep])
     batch = replace(group.batch, priors=priors, curvature_per_mm=group.batch.curvature_per_mm[keep])
-    state = State(*(v[keep] for v in (group.state.offset_mm, group.state.offset_px, group.state.blur_px)))
-    return Group(group.kind, group.index[keep], group.poses.take(keep), batch, state)
+    return Group(group.kind, group.index[keep], group.poses.take(keep), batch, group.state.take(keep))
 
 
 def _first_group(camera: Camera, pattern: Pattern, kind: TargetKind, index: Index, poses: Poses, assumptions: Assumptions) -> Group:
@@ -131,11 +135,13 @@ def _first_group(camera: Camera, pattern: Pattern, kind: TargetKind, index: Inde
         offset_px_sigma=assumptions.tone_shift_px,
         blur_px=FIRST_BLUR_PX,
         log_blur_sigma=FIRST_LOG_BLUR_SIGMA,
+        log_gamma=0.0,
+        log_gamma_sigma=FIRST_LOG_GAMMA_SIGMA,
         turns_freely=kind.turns_freely,
     )
     batch = Batch(camera, pattern.curvature_per_mm[index], rings_of(kind), priors)
     zero = np.zeros(count)
-    return Group(kind, index, poses, batch, State(zero, zero, np.full(count, FIRST_BLUR_PX)))
+    return Group(kind, index, poses, batch, State(zero, zero, np.full(count, FIRST_BLUR_PX), zero))
 
 
 def _on_ellipses(group: Group, pattern: Pattern, detections: Detections, identity: Identity) -> Group:
@@ -216,11 +222,28 @@ def learn(camera: Camera, pattern: Pattern, start: Pose, coarse: list[Coarse], a
     good = np.isfinite(centers).all(axis=1)
     pose = rigid_pose(pattern, index[good], camera, centers[good], start) if good.sum() >= 4 else start
     noise = noise_model([c.pixels.grey for c in coarse], [c.adjusted.residual for c in coarse], [c.pixels.used for c in coarse], [False] * len(coarse))
+    tone = shared_tone(coarse)
     if assumptions.normal_sigma_deg is not None:
-        return Shared(pose, noise, max(np.radians(assumptions.normal_sigma_deg), LEAST_NORMAL_SIGMA_RAD))
+        return Shared(pose, noise, max(np.radians(assumptions.normal_sigma_deg), LEAST_NORMAL_SIGMA_RAD), *tone)
     tilt, covariance = zip(*(free_tilt(c, pose.rotation @ pattern.normal[c.group.index].T) for c in coarse), strict=True)
     settled = np.concatenate([c.adjusted.converged for c in coarse])
-    return Shared(pose, noise, normal_spread(np.concatenate(tilt)[settled], np.concatenate(covariance)[settled]))
+    return Shared(pose, noise, normal_spread(np.concatenate(tilt)[settled], np.concatenate(covariance)[settled]), *tone)
+
+
+def shared_tone(coarse: list[Coarse]) -> tuple[float, float]:
+    """log gamma of the photograph and its sigma, from all targets: one camera has one tone curve."""
+    value = np.concatenate([c.adjusted.state.log_gamma for c in coarse])
+    variance = np.concatenate([inverse_scaled(c.adjusted.information)[:, TONE, TONE] for c in coarse])
+    good = np.isfinite(variance) & (variance > 0) & np.concatenate([c.adjusted.converged for c in coarse])
+    if good.sum() < 4:
+        return 0.0, FIRST_LOG_GAMMA_SIGMA
+    # take each target's prior out again, then pool; the median keeps a few strange targets from deciding
+    data = np.maximum(1 / variance[good] - FIRST_LOG_GAMMA_SIGMA**-2, 1e-9)
+    free = value[good] / np.maximum(variance[good] * data, 1e-9)
+    near = np.abs(free - np.median(free)) < STRAY_SIGMAS / np.sqrt(data) + 1e-3
+    total = data[near].sum()
+    sigma = max(total**-0.5, LEAST_LOG_GAMMA_SIGMA)
+    return float(np.clip((data[near] * free[near]).sum() / total, -1.2, 1.2)), float(min(sigma, FIRST_LOG_GAMMA_SIGMA))
 
 
 def free_tilt(coarse: Coarse, expected: Array) -> tuple[Array, Array]:
@@ -264,6 +287,7 @@ def full_fit(image: NDArray[np.generic], pattern: Pattern, coarse: Coarse, share
     expected = shared.camera_from_dish.rotate(pattern.normal[group.index])
     blur = float(np.median(group.state.blur_px))
     priors = replace(group.batch.priors, normal=expected, normal_sigma_rad=np.full(len(expected), shared.normal_sigma_rad), blur_px=blur)
+    priors = replace(priors, log_gamma=shared.log_gamma, log_gamma_sigma=shared.log_gamma_sigma)
     group = replace(group, batch=replace(group.batch, priors=priors))
     widest = float(np.quantile(group.state.blur_px, 0.9))
     batch, pixels = layout(image, group, widest, widest)

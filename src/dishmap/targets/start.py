@@ -81,7 +81,7 @@ def fit_ellipses(batch: Batch, kind: TargetKind, poses: Poses, patches: Patches,
     count = len(poses)
     sign = np.where(kind.dark[points.circle], 1.0, -1.0)[:, None]
     st = (points.pixels - patches.anchor_px[points.target][:, None]) / patches.scale_px[points.target][:, None, None]
-    state = State(np.zeros(count), np.zeros(count), np.full(count, batch.priors.blur_px))
+    state = State(np.zeros(count), np.zeros(count), np.full(count, batch.priors.blur_px), np.zeros(count))
     center, radius = kind.center_mm[points.circle], kind.radius_mm[points.circle]
     for _ in range(ELLIPSE_STEPS):
         maps = batch.maps(poses, patches)
