@@ -17,7 +17,8 @@ from dishmap.targets.detect import Detections, find_ellipses
 from dishmap.targets.identify import Hint, Identity, identify
 from dishmap.targets.paper import PaperPoses, paper_poses
 from dishmap.targets.pattern import Pattern
-from dishmap.targets.pose import Assumptions, TargetPoses, check_image, measure_targets
+from dishmap.targets.pose import TargetPoses, check_image, measure_targets
+from dishmap.targets.stages import Assumptions
 from dishmap.transforms import Pose
 
 METHODS = ("pose", "paper")
@@ -110,7 +111,9 @@ def _paper_cloud(poses: PaperPoses) -> PointCloud:
     """Points of the paper's method, which gives no uncertainty: covariances are zero and mean `unknown`."""
     n = len(poses)
     zero = np.zeros((n, 3, 3))
-    return PointCloud(poses.ids, poses.position_mm, poses.normal, poses.center_px, zero, np.zeros(n), zero[:, :2, :2], None, poses.quality, "camera")
+    return PointCloud(
+        poses.ids, poses.position_mm, poses.normal, poses.center_px, zero, np.zeros(n), zero[:, :2, :2], None, poses.quality, "camera"
+    )
 
 
 def _surface(cloud: PointCloud, camera_from_dish: Pose, basis: Basis, camera: Camera, weighted: bool) -> tuple[SurfaceFit | None, str]:

@@ -58,7 +58,9 @@ def parse_pose(text: str, key: str, source: str = "the pose") -> Pose:
         turn = _three(parts[ROTATION], f"{key}.{ROTATION}", LARGEST_ANGLE_DEG, "degrees")
         move = _three(parts[TRANSLATION], f"{key}.{TRANSLATION}", LARGEST_TRANSLATION_MM, "mm")
     except InputError as error:
-        raise InputError(f'{source}: {error}; a pose file is {{"{key}": {{"{ROTATION}": [0, 0, 0], "{TRANSLATION}": [0, 0, 0]}}}}') from error
+        raise InputError(
+            f'{source}: {error}; a pose file is {{"{key}": {{"{ROTATION}": [0, 0, 0], "{TRANSLATION}": [0, 0, 0]}}}}'
+        ) from error
     return Pose.from_rotation_vector(np.radians(turn), move)
 
 
@@ -111,7 +113,5 @@ def _three(values: Any, name: str, largest: float, unit: str) -> NDArray[np.floa
     # comparing, not converting: an integer may be too long for a float
     if not numbers or len(values) != 3 or not all(-largest <= v <= largest for v in values):
         shown = json.dumps(values)
-        raise InputError(
-            f"{name} needs three numbers within {largest:g} {unit}, not {shown if len(shown) <= 60 else f'{shown[:57]}...'}"
-        )
+        raise InputError(f"{name} needs three numbers within {largest:g} {unit}, not {shown if len(shown) <= 60 else f'{shown[:57]}...'}")
     return np.asarray(values, dtype=float)

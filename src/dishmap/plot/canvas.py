@@ -37,7 +37,7 @@ STYLE = {
     "legend.frameon": False,
 }
 # Colours go by the logarithm where values span more than this factor.
-LOG_SPAN = 10.0
+LOG_SPAN = 4.0
 
 
 def as_svg(draw: Callable[P, Figure]) -> Callable[P, str]:
@@ -63,7 +63,7 @@ def new_figure(width_in: float, height_in: float) -> tuple[Figure, Axes]:
 
 
 def color_norm(values: ArrayLike) -> Normalize:
-    """Scale of colours for positive values: linear, or logarithmic where they span more than a factor of ten."""
+    """Scale of colours for positive values: linear, or logarithmic where they span more than LOG_SPAN."""
     good = np.asarray(values, dtype=float)
     good = good[np.isfinite(good)]
     low, high = (float(good.min()), float(good.max())) if good.size else (0.0, 1.0)

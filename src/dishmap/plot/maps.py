@@ -16,8 +16,10 @@ CHART_IN = (6.2, 4.4)
 LEVELS = 20
 # Names beside points stay readable up to so many.
 MOST_NAMES = 12
-# An arrow of the longest kind takes this part of the map's width; those of the strays beyond this quantile may be longer.
+# An arrow of the longest kind takes this part of the map's width; strays beyond this quantile may be longer,
 LONGEST_ARROW, ARROW_QUANTILE = 0.12, 0.95
+# ... but are cut at so many times that length.
+LONGEST_SHOWN = 1.6
 # Beyond this factor the spread found is drawn beside the one claimed.
 SPREAD_WORTH_DRAWING = 1.5
 # Bins of a histogram hold on average so many points, within limits.
@@ -63,14 +65,17 @@ def normals_map(xy_mm: Array, lean_rad: Array, reference: str) -> Figure:
     lean_deg = np.degrees(lean_rad)
     length_deg = np.hypot(*lean_deg.T)
     typical = float(np.quantile(length_deg, ARROW_QUANTILE)) or float(length_deg.max()) or 1.0
-    span = _span(xy_mm)
-    scale = typical / (LONGEST_ARROW * span)
+    long = length_deg > LONGEST_SHOWN * typical
+    shown = np.where(long[:, None], lean_deg * (LONGEST_SHOWN * typical / np.maximum(length_deg, typical))[:, None], lean_deg)
+    scale = typical / (LONGEST_ARROW * _span(xy_mm))
     axes.scatter(*xy_mm.T, s=7, c=FAINT, zorder=2)
-    arrows = axes.quiver(
-        *xy_mm.T, *lean_deg.T, angles="xy", scale_units="xy", scale=scale, color=BLUE, width=0.004, headwidth=4, headlength=4.5, zorder=3
-    )
+    style = {"angles": "xy", "scale_units": "xy", "scale": scale, "width": 0.004, "headwidth": 4, "headlength": 4.5, "zorder": 3}
+    arrows = axes.quiver(*xy_mm.T, *shown.T, color=np.where(long, ORANGE, BLUE).tolist(), **style)
+    axes.set_title(" ", pad=14)  # room for the key
     key = round_length(typical)
-    axes.quiverkey(arrows, 0.02, 1.04, key, f"{key:g}° from the {reference}", labelpos="E", coordinates="axes", color=BLUE)
+    axes.quiverkey(arrows, 0.0, 1.035, key, f"{key:g}° from the {reference}", labelpos="E", coordinates="axes", color=BLUE)
+    if long.any():
+        axes.text(1.0, 1.035, "longer", color=ORANGE, ha="right", va="center", transform=axes.transAxes)
     _dish_axes(axes, xy_mm)
     return figure
 
@@ -85,7 +90,7 @@ def ratio_histogram(ratio: Array, spread: float) -> Figure:
     reach = max(4.0, 1.15 * float(np.abs(ratio).max()))
     if spread > 0:
         reach = min(reach, max(4.0, 6.0 * spread))
-    bins = int(np.clip(len(ratio) // POINTS_PER_BIN, FEWEST_BINS, MOST_BINS))
+    bins = int(np.clip(len(ratio) / POINTS_PER_BIN * reach / max(4.0, 3.0 * spread), FEWEST_BINS, MOST_BINS))
     inside = np.clip(ratio, -reach, reach)
     density, *_ = axes.hist(inside, bins=bins, range=(-reach, reach), density=True, color="#a6cee3", edgecolor="#4d7ea8", linewidth=0.6)
     x = np.linspace(-reach, reach, 801)

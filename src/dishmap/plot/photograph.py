@@ -11,6 +11,7 @@ from html import escape
 
 import cv2
 import numpy as np
+from matplotlib.colors import Normalize
 from numpy.typing import NDArray
 
 from dishmap.camera.uncertainty import ProjectionError
@@ -21,9 +22,9 @@ JPEG_QUALITY = 82
 LEGEND_HEIGHT = 76.0
 PICTURE_ID = "photograph"
 # Letters between these sizes; where targets stand too close for the smaller, ids show on hovering only.
-SMALLEST_TEXT, LARGEST_TEXT = 8.0, 26.0
+SMALLEST_TEXT, LARGEST_TEXT = 8.0, 20.0
 # Width of a digit over its height, and the part of a target's spacing that its id may take.
-DIGIT_WIDTH, TEXT_PART = 0.6, 0.75
+DIGIT_WIDTH, TEXT_PART = 0.6, 0.4
 WHITE_PERCENTILE = 99.5
 # The largest circle of expected error takes this part of the spacing of the grid.
 CIRCLE_PART = 0.48
@@ -34,7 +35,7 @@ class Outline:
     """Ellipses (K, 3, 2) of one target, each as its centre and the ends of two conjugate radii, in pixels of the photograph.
 
     label: the text at `label_px`; title: what hovering tells; sigma: for the colour, NaN when unknown; state: `good`,
-    `rejected` or `missing`.
+    `rejected`, `missing` or `unused` (looks like a mark, is none).
     """
 
     ellipses_px: Array
@@ -80,8 +81,8 @@ def photograph_svg(image: NDArray[np.generic], outlines: list[Outline], sigma_la
     for outline in outlines:
         color = hex_colors([outline.sigma], norm)[0] if np.isfinite(outline.sigma) else BLUE
         body.append(_outline(frame, outline, color, text))
-    legend = _legend(frame, norm.vmin, norm.vmax, norm.inverse, sigma_label) if known.size else ""
-    return _svg(frame, LEGEND_HEIGHT if known.size else 0.0, alt, [*body, legend])
+    legend = _legend(frame, norm, sigma_label) if known.size else ""
+    return _svg(frame, 0.0, LEGEND_HEIGHT if known.size else 0.0, alt, [*body, legend])
 
 
 def error_svg(error: ProjectionError, width_px: int, height_px: int, alt: str, with_picture: bool) -> str:
@@ -102,18 +103,19 @@ def error_svg(error: ProjectionError, width_px: int, height_px: int, alt: str, w
     marks = f'<g fill="none" stroke="#ffffff" stroke-width="5" opacity="0.7">{"".join(circles)}</g>' if with_picture else ""
     marks += f'<g fill="{BLUE}" fill-opacity="0.15" stroke="{BLUE}" stroke-width="2.2">{"".join(circles)}</g>'
     key = round_length(largest) if largest > 0 else 0.0
-    radius, middle = key * units_per_px, frame.height + LEGEND_HEIGHT / 2
+    radius, middle = key * units_per_px, frame.height + CIRCLE_PART * spacing + LEGEND_HEIGHT / 2
     legend = (
         f'<circle cx="{radius + 6:.1f}" cy="{middle:.1f}" r="{radius:.1f}" fill="none" stroke="{BLUE}" stroke-width="2.2"/>'
         f'<text x="{2 * radius + 18:.1f}" y="{middle + 8:.1f}" font-size="24" fill="{INK}">this radius is an expected error of {key:g} px</text>'
     )
-    return _svg(frame, LEGEND_HEIGHT, alt, [back, marks, legend])
+    return _svg(frame, CIRCLE_PART * spacing, LEGEND_HEIGHT, alt, [back, marks, legend])
 
 
-def _svg(frame: Frame, below: float, alt: str, body: list[str]) -> str:
-    height = frame.height + below
+def _svg(frame: Frame, around: float, below: float, alt: str, body: list[str]) -> str:
+    """The SVG element with a margin around the picture and room below it, in units."""
+    view = f"{-around:.1f} {-around:.1f} {frame.width + 2 * around:.1f} {frame.height + 2 * around + below:.1f}"
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" class="picture" role="img" aria-label="{escape(alt)}" viewBox="0 0 {frame.width:.1f} {height:.1f}" '
+        f'<svg xmlns="http://www.w3.org/2000/svg" class="picture" role="img" aria-label="{escape(alt)}" viewBox="{view}" '
         f'style="width:{100 * frame.width / BOX[0]:.1f}%" font-family="sans-serif">{"".join(body)}</svg>'
     )
 
@@ -149,8 +151,8 @@ def _text_size(frame: Frame, outlines: list[Outline]) -> float:
 
 
 def _outline(frame: Frame, outline: Outline, color: str, text: float) -> str:
-    color = {"good": color, "rejected": "#e31a1c", "missing": "#ffffff"}[outline.state]
-    dash = "" if outline.state == "good" else ' stroke-dasharray="7 4"'
+    color = {"good": color, "rejected": "#e31a1c", "missing": "#ffffff", "unused": "#e31a1c"}[outline.state]
+    dash = {"good": "", "unused": ' stroke-dasharray="2 3"'}.get(outline.state, ' stroke-dasharray="7 4"')
     rings = []
     for ellipse in frame.place(outline.ellipses_px).tolist():
         (x, y), (ax, ay), (bx, by) = ellipse
@@ -172,19 +174,16 @@ def _outline(frame: Frame, outline: Outline, color: str, text: float) -> str:
     return f"<g><title>{escape(outline.title)}</title>{lines}{name}</g>"
 
 
-def _legend(frame: Frame, low: float | None, high: float | None, inverse: object, label: str) -> str:
-    """A strip of colours with five values under it."""
-    assert low is not None and high is not None and callable(inverse)
-    norm = color_norm([low, high])
-    parts, width, top = [], 520.0, frame.height + 12
-    steps = 52
-    colors = hex_colors(inverse((np.arange(steps) + 0.5) / steps), norm)
+def _legend(frame: Frame, norm: Normalize, label: str) -> str:
+    """A strip of colours with its values under it and what they are beside it."""
+    left, width, top, steps = 60.0, 520.0, frame.height + 12, 52
+    colors = hex_colors(norm.inverse((np.arange(steps) + 0.5) / steps), norm)
     parts = [
-        f'<rect x="{i * width / steps + 20:.1f}" y="{top:.1f}" width="{width / steps + 0.5:.1f}" height="20" fill="{color}"/>'
+        f'<rect x="{i * width / steps + left:.1f}" y="{top:.1f}" width="{width / steps + 0.5:.1f}" height="20" fill="{color}" shape-rendering="crispEdges"/>'
         for i, color in enumerate(colors)
     ]
     for part in (0.0, 0.5, 1.0):
-        value = float(inverse(part))
-        parts.append(f'<text x="{20 + part * width:.1f}" y="{top + 48:.1f}" font-size="22" text-anchor="middle" fill="{INK}">{value:.3g}</text>')
-    parts.append(f'<text x="{width + 60:.1f}" y="{top + 18:.1f}" font-size="24" fill="{INK}">{escape(label)}</text>')
+        x, value = left + part * width, float(norm.inverse(part))
+        parts.append(f'<text x="{x:.1f}" y="{top + 48:.1f}" font-size="24" text-anchor="middle" fill="{INK}">{value:.3g}</text>')
+    parts.append(f'<text x="{left + width + 40:.1f}" y="{top + 18:.1f}" font-size="24" fill="{INK}">{escape(label)}</text>')
     return "".join(parts)

@@ -7,16 +7,30 @@ target, planar light levels per ring. Gauss-Newton with limited steps; robust we
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.camera.model import Camera
 from dishmap.targets.edges import LocalMaps, Patches, Poses, local_maps
-from dishmap.targets.pixels import BLUR, GEOMETRY, OFFSET_MM, OFFSET_PX, TONE, RingPixels, Rings, RingSums, State, Weighting, ring_sums, without_light
+from dishmap.targets.pixels import (
+    BLUR,
+    GEOMETRY,
+    OFFSET_MM,
+    OFFSET_PX,
+    TONE,
+    RingPixels,
+    Rings,
+    RingSums,
+    State,
+    Weighting,
+    ring_sums,
+    without_light,
+)
 from dishmap.transforms import rotation_from_vector
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 # A step moves no edge by more than this, so that the linear model holds (edges are about a blur wide).
 LARGEST_STEP_PX = 1.5
@@ -67,16 +81,19 @@ class Batch:
 
 @dataclass(frozen=True)
 class Adjusted:
-    """Result of `adjust`: poses, nuisances, and per target the normal matrix (T, G, G) with and without the priors,
-    in units of the noise variance; converged (T,); last pass's ring sums and residuals; noise_variance (T,) grey^2."""
+    """Result of `adjust`.
+
+    poses and state (nuisances); information and data_information (T, G, G): the normal matrix with and without the priors, in
+    units of the noise variance; converged (T,); sums and residual: of the last pass; noise_variance (T,), grey^2.
+    """
 
     poses: Poses
     state: State
     information: Array
     data_information: Array
-    converged: NDArray[np.bool_]
+    converged: NDArray[Any]
     sums: RingSums
-    residual: NDArray[np.float32]
+    residual: NDArray[Any]
     noise_variance: Array
 
 

@@ -8,6 +8,7 @@ length locates a straight edge of blur s to sqrt(2 sqrt(pi) s) / C px across it,
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,7 +22,7 @@ from dishmap.targets.pixels import RingSums, State, coverage_columns, light_colu
 from dishmap.targets.stages import FIRST_LOG_BLUR_SIGMA, Assumptions, Group, layout
 from dishmap.targets.start import centers_of
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 # Wide enough to say nothing of the normal.
 FREE_NORMAL_SIGMA_RAD = np.pi
@@ -31,8 +32,11 @@ PIXEL_VARIANCE_PX2 = 1 / 12
 
 @dataclass(frozen=True)
 class Bound:
-    """Least standard deviations of T targets: covariance_px2 (T, 2, 2) of the centre, covariance_mm2 (T, 3, 3) of the position
-    in the camera frame, depth_mm (T,) along the camera's z, normal_rad (T,) root mean square angle."""
+    """Least errors of T targets.
+
+    covariance_px2 (T, 2, 2) of the projected centre; covariance_mm2 (T, 3, 3) of the position in the camera frame; depth_mm (T,)
+    along the camera's z and normal_rad (T,), root mean square angle, are standard deviations.
+    """
 
     covariance_px2: Array
     covariance_mm2: Array

@@ -8,6 +8,7 @@ under each pose parameter. That makes the model of the pixels the same few lines
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from dishmap.camera.model import Camera
 from dishmap.targets.pattern import bent_print_mm
 from dishmap.transforms import cross_matrix
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 # Degrees of the pixel -> plane polynomial: the first is used unless it leaves more than MISFIT_PX anywhere on its nodes.
 PLANE_DEGREES = (3, 5)
@@ -46,7 +47,7 @@ def _derivative_matrix(axis: int, degree: int) -> Array:
 DERIVATIVES = {degree: (_derivative_matrix(0, degree), _derivative_matrix(1, degree)) for degree in PLANE_DEGREES}
 
 
-def monomials(s: NDArray[np.floating], t: NDArray[np.floating], degree: int) -> NDArray[np.floating]:
+def monomials(s: NDArray[Any], t: NDArray[Any], degree: int) -> NDArray[Any]:
     """Monomials (..., K, n) of s, t (..., n) up to `degree`, in the order of their total degree."""
     out = np.empty((*s.shape[:-1], len(_powers(degree)), s.shape[-1]), dtype=s.dtype)
     out[..., 0, :] = 1
@@ -69,7 +70,7 @@ class Poses:
     def __len__(self) -> int:
         return len(self.position_mm)
 
-    def take(self, index: NDArray[np.int64] | NDArray[np.bool_] | slice) -> Poses:
+    def take(self, index: NDArray[np.int64] | NDArray[Any] | slice) -> Poses:
         """Return the poses at `index`."""
         return Poses(self.rotation[index], self.position_mm[index])
 
@@ -92,8 +93,11 @@ class Poses:
 
 @dataclass(frozen=True)
 class Patches:
-    """Small areas of targets over which maps are fitted: target (M,) index, center_mm (M, 2), reach_mm (M,) in its plane,
-    anchor_px (M, 2) and scale_px (M,) of the pixel coordinates s = (u - anchor_u) / scale, t = (v - anchor_v) / scale."""
+    """Small areas of targets over which maps are fitted.
+
+    target (M,) index; center_mm (M, 2) and reach_mm (M,) in its plane; anchor_px (M, 2) and scale_px (M,) of the pixel
+    coordinates s = (u - anchor_u) / scale, t = (v - anchor_v) / scale.
+    """
 
     target: NDArray[np.int64]
     center_mm: Array
@@ -181,13 +185,12 @@ def _least_squares(basis: Array, values: Array) -> Array:
     return np.swapaxes(np.linalg.solve(normal, basis @ np.swapaxes(values, 1, 2)), 1, 2)
 
 
-def edge_distance(
-    six: NDArray[np.floating], center_mm: NDArray[np.floating], radius_mm: NDArray[np.floating]
-) -> tuple[NDArray[np.floating], ...]:
+def edge_distance(six: NDArray[Any], center_mm: NDArray[Any], radius_mm: NDArray[Any]) -> tuple[NDArray[Any], ...]:
     """Signed distance in pixels from points to one projected circle, positive inside.
 
-    six (M, 6, n): x, y, dx/du, dx/dv, dy/du, dy/dv at each point; center_mm (M, 2) and radius_mm (M,) of each row's circle. Returns distance_px, unit outward normal u and v, px of edge motion per mm of radius, and the
-    curvature of the projected circle at the foot point (1/px, positive for a convex inside).
+    six (M, 6, n): x, y, dx/du, dx/dv, dy/du, dy/dv at each point; center_mm (M, 2) and radius_mm (M,) of each row's circle.
+    Returns distance_px, unit outward normal u and v, px of edge motion per mm of radius, and the curvature of the projected
+    circle at the foot point (1/px, positive for a convex inside), each (M, n).
 
     The distance is along the gradient n of rho = |x - center|, to where x + t J n meets the circle (J = d plane / d pixel):
     exact for a locally affine map. Level lines of rho are not parallel where the target is tilted; the plain ratio

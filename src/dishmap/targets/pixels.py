@@ -5,7 +5,8 @@ Each outermost circle with what is nested in it is one ring here. Its pixels fol
     I(u, v) = ground(u, v) (1 - c) + ink(u, v) c,   c = sum over circles of +-Phi(d / s)
 
 with planar ground and ink levels of each ring, d the signed distance to the projected circle and s the total blur
-(s^2 = psf^2 + 1/12 for the pixel's own area). A camera's tone curve, level = light^(1 / gamma), bends c (`toned`). Curved edges: averaging Phi((d - k t^2 / 2) / s) over the blur along the edge
+(s^2 = psf^2 + 1/12 for the pixel's own area). A camera's tone curve, level = light^(1 / gamma), bends c (`toned`).
+Curved edges: averaging Phi((d - k t^2 / 2) / s) over the blur along the edge
 (curvature k) shifts the edge by k s^2 / 2 (1 + 3/4 k^2 s^2) and widens it by k^2 s^4 / 2. Where k s is too large for that
 series the ring is computed on a finer grid with little blur and then blurred exactly (`_fine_columns`).
 """
@@ -13,6 +14,7 @@ series the ring is computed on a finer grid with little blur and then blurred ex
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +23,9 @@ from scipy.special import ndtr
 from dishmap.targets.edges import MOTION_TERMS, LocalMaps, Patches, edge_distance, monomials
 from dishmap.targets.pattern import TargetKind
 
-Array = NDArray[np.float64]
-Single = NDArray[np.float32]
-Bool = NDArray[np.bool_]
+Array = NDArray[Any]
+Single = NDArray[Any]
+Bool = NDArray[Any]
 
 # Geometry parameters of a target: 3 moves (mm), 3 turns (rad), edge offset (mm), edge offset (px), blur s (px), log gamma.
 GEOMETRY = 10
@@ -108,8 +110,10 @@ class RingPixels:
 
 @dataclass(frozen=True)
 class State:
-    """Nuisances of T targets that the geometry needs, each (T,): offset_mm and offset_px (ink moved outwards), blur_px, and
-    log_gamma of the tone curve."""
+    """Nuisances of T targets that the geometry needs, each (T,).
+
+    offset_mm and offset_px: ink moved outwards; blur_px; log_gamma: of the tone curve.
+    """
 
     offset_mm: Array
     offset_px: Array

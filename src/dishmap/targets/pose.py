@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +25,9 @@ from dishmap.targets.scene_noise import NoiseModel, noise_model
 from dishmap.targets.sensitivity import calibration_jacobian, mirror_evidence, mirrored_normals
 from dishmap.targets.stages import Assumptions, Group, Shared, coarse_fit, full_fit, learn, regroup, start_groups
 from dishmap.targets.start import centers_of
-from dishmap.targets.window import sharpest_curvature_per_px
 from dishmap.transforms import Pose, angle_between_rad
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 Index = NDArray[np.int64]
 
 SMALLEST_RADIUS_PX = 2.0
@@ -82,7 +82,7 @@ class TargetPoses:
 
 
 def measure_targets(
-    image: NDArray[np.generic],
+    image: NDArray[Any],
     camera: Camera,
     pattern: Pattern,
     detections: Detections,
@@ -105,7 +105,7 @@ def measure_targets(
     for group in groups:
         fit = coarse_fit(image, group)
         if not np.isfinite(fit.adjusted.poses.position_mm).all():
-            good = np.isfinite(fit.adjusted.poses.position_mm).all(axis=(1,))
+            good = np.asarray(np.isfinite(fit.adjusted.poses.position_mm).all(axis=1))
             rejected += [(int(pattern.ids[i]), "its pixels do not look like the printed target") for i in group.index[~good]]
             if not good.any():
                 continue
@@ -113,7 +113,9 @@ def measure_targets(
         coarse.append(fit)
         tell(len(coarse), total)
     if not coarse:
-        raise MeasurementError("no named target lies wholly inside the image; move the camera back or turn it so that whole targets are seen")
+        raise MeasurementError(
+            "no named target lies wholly inside the image; move the camera back or turn it so that whole targets are seen"
+        )
     shared = learn(camera, pattern, identity.camera_from_dish, coarse, assumptions)
     fits = []
     for fit in coarse:
@@ -122,7 +124,7 @@ def measure_targets(
     return _collect(image, pattern, fits, shared, rejected)
 
 
-def check_image(image: NDArray[np.generic], camera: Camera) -> None:
+def check_image(image: NDArray[Any], camera: Camera) -> None:
     """Raise ImageError or CameraError unless `image` is a grey picture of the camera's size without NaN."""
     if image.ndim != 2 or not image.size:
         raise ImageError(f"the image must be one grey picture (height, width), not an array of shape {image.shape}")
@@ -137,7 +139,11 @@ def check_image(image: NDArray[np.generic], camera: Camera) -> None:
 
 
 def _collect(
-    image: NDArray[np.generic], pattern: Pattern, fits: list[tuple[Group, Adjusted, RingPixels]], shared: Shared, rejected: list[tuple[int, str]]
+    image: NDArray[Any],
+    pattern: Pattern,
+    fits: list[tuple[Group, Adjusted, RingPixels]],
+    shared: Shared,
+    rejected: list[tuple[int, str]],
 ) -> TargetPoses:
     blocks = [p.shape is None for _, _, p in fits]
     pooled = noise_model([p.grey for _, _, p in fits], [a.residual for _, a, _ in fits], [p.used for _, _, p in fits], blocks)
@@ -163,7 +169,7 @@ def _collect(
     )
 
 
-def _results(image: NDArray[np.generic], group: Group, adjusted: Adjusted, pixels: RingPixels, noise: NoiseModel) -> dict[str, Array]:
+def _results(image: NDArray[Any], group: Group, adjusted: Adjusted, pixels: RingPixels, noise: NoiseModel) -> dict[str, Array]:
     """Columns of TargetPoses for one group, keyed by field name."""
     count, batch, poses = len(group.index), group.batch, adjusted.poses
     data = adjusted.data_information / noise.inflation
@@ -207,7 +213,15 @@ def _kept(adjusted: Adjusted, pixels: RingPixels, count: int) -> Array:
     return np.where(np.bincount(pixels.target[seen], minlength=count) > 0, out, 0.0)
 
 
-def _quality(image, group: Group, adjusted: Adjusted, pixels: RingPixels, columns: dict[str, Array], information: Array, edge_information: Array) -> Index:
+def _quality(
+    image: NDArray[Any],
+    group: Group,
+    adjusted: Adjusted,
+    pixels: RingPixels,
+    columns: dict[str, Array],
+    information: Array,
+    edge_information: Array,
+) -> Index:
     count = len(group.index)
     bits = np.zeros(count, np.int64)
 
@@ -215,7 +229,7 @@ def _quality(image, group: Group, adjusted: Adjusted, pixels: RingPixels, column
         bits[where] |= int(bit)
 
     outlines = group.outlines()
-    flag(~group.batch.camera.contains(outlines, margin_px=1.0).all(axis=(1, 2)), Quality.CLIPPED)
+    flag(~np.asarray(group.batch.camera.contains(outlines, margin_px=1.0).all(axis=(1, 2))), Quality.CLIPPED)
     flag(~adjusted.converged, Quality.NOT_CONVERGED)
     flag(columns["contrast"] < LEAST_CONTRAST_SIGMAS * columns["noise"], Quality.NO_CONTRAST)
     flag(adjusted.noise_variance > POOR_FIT_RATIO, Quality.POOR_FIT)
@@ -247,7 +261,7 @@ def _ambiguous(group: Group, adjusted: Adjusted, columns: dict[str, Array], edge
     return out
 
 
-def _lost_edges(image, adjusted: Adjusted, pixels: RingPixels, count: int) -> tuple[Array, Array]:
+def _lost_edges(image: NDArray[Any], adjusted: Adjusted, pixels: RingPixels, count: int) -> tuple[Array, Array]:
     """Whether what is in front of each target is brighter than the model (T,), and whether any edge was lost (T,)."""
     lost = np.zeros(count, bool)
     seen = pixels.used.any(axis=1)

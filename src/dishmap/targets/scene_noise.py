@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 LEVELS = 12
 # Grey levels between which the variance must differ clearly before a slope is used (2 = photon noise over 4:1 in light).
@@ -19,8 +20,11 @@ LEAST_CORRELATION = 0.01
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """variance = base + slope * grey level (grey^2); `inflation`: how much correlation between neighbouring pixels
-    (JPEG, demosaicing, resampling) enlarges the variance of anything that averages over many pixels (1 for white noise)."""
+    """Noise of a photograph: variance = base + slope * grey level, in grey levels squared.
+
+    inflation: how much correlation between neighbouring pixels (JPEG, demosaicing, resampling) enlarges the variance of
+    anything that averages over many pixels; 1 for white noise.
+    """
 
     base: float
     slope: float
@@ -31,7 +35,7 @@ class NoiseModel:
         return np.maximum(self.base + self.slope * np.maximum(grey, 0), 1e-6)
 
 
-def noise_model(grey: list[Array], residual: list[Array], used: list[NDArray[np.bool_]], blocks: list[bool]) -> NoiseModel:
+def noise_model(grey: list[Array], residual: list[Array], used: list[NDArray[Any]], blocks: list[bool]) -> NoiseModel:
     """Fit the noise model to residuals of rings (M, n); `blocks`: pixels come in 2x2 blocks of neighbours (see window)."""
     values = np.concatenate([(g - r)[u] for g, r, u in zip(grey, residual, used, strict=True)])
     errors = np.concatenate([r[u] for r, u in zip(residual, used, strict=True)])
@@ -63,7 +67,7 @@ def _variance_line(values: Array, errors: Array) -> tuple[float, float]:
     return max(base, 1e-3), slope
 
 
-def _correlations(residual: Array, used: NDArray[np.bool_]) -> tuple[float, float, float]:
+def _correlations(residual: Array, used: NDArray[Any]) -> tuple[float, float, float]:
     """Correlation of residuals between horizontal, vertical and diagonal neighbours within blocks of 2x2."""
     scale = ROBUST_TO_SIGMA * np.median(np.abs(residual[used])) if used.any() else 1.0
     clipped = np.where(used & (np.abs(residual) < 4 * scale), residual, 0.0).reshape(len(residual), -1, 4)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,7 +13,7 @@ from dishmap.targets.pattern import TargetKind, bent_print_mm
 from dishmap.targets.window import OUTLINE_POINTS
 from dishmap.transforms import rotation_from_vector
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 MIRROR_STEPS = 4
 
@@ -33,7 +35,7 @@ def _edge_normals(pixels: Array, kind: TargetKind) -> tuple[Array, Array]:
 
 
 def calibration_jacobian(batch: Batch, kind: TargetKind, poses: Poses, edge_information: Array) -> Array:
-    """d position (camera frame, mm) / d camera parameters (T, 3, P): how the fit follows when the camera is a little different.
+    """D position (camera frame, mm) / d camera parameters (T, 3, P): how the fit follows when the camera is a little different.
 
     edge_information (T,): information per px of edge (1 / px^2 per px), so that the prior on normals has its due weight.
     """

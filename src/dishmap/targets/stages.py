@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +20,9 @@ from dishmap.targets.start import EllipsePoints, centers_of, ellipse_points, fit
 from dishmap.targets.window import outline, patches_around, ring_areas, ring_layout, ring_pixels
 from dishmap.transforms import Pose, angle_between_rad
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 Index = NDArray[np.int64]
-Bool = NDArray[np.bool_]
+Bool = NDArray[Any]
 
 # First guesses, wide enough for any sharp photograph.
 FIRST_BLUR_PX, FIRST_LOG_BLUR_SIGMA = 0.9, 1.0
@@ -111,7 +112,7 @@ def start_groups(
             part = order[begin : begin + GROUP_SIZE]
             group = _first_group(camera, pattern, kind, index[part], poses.take(part), assumptions)
             group = _on_ellipses(group, pattern, detections, identity)
-            inside = camera.contains(group.outlines(), margin_px=1.0).all(axis=(1, 2))
+            inside = np.asarray(camera.contains(group.outlines(), margin_px=1.0).all(axis=(1, 2)))
             rejected += [(int(pattern.ids[i]), "it reaches beyond the image") for i in group.index[~inside]]
             if inside.any():
                 groups.append(regroup(group, inside))
@@ -174,7 +175,7 @@ def _shifted(group: Group, points: Array, target: Index, circle: Index) -> Poses
     return Poses(group.poses.rotation, np.where(np.isfinite(position), position, group.poses.position_mm))
 
 
-def layout(image: NDArray[np.generic], group: Group, blur_px: float, band_blur_px: float) -> tuple[Batch, RingPixels]:
+def layout(image: NDArray[Any], group: Group, blur_px: float, band_blur_px: float) -> tuple[Batch, RingPixels]:
     """Rings and pixels of a group for a given blur, in a band wide enough for `band_blur_px`."""
     outlines = group.outlines()
     middle = outlines.mean(axis=2, keepdims=True)
@@ -188,7 +189,7 @@ def layout(image: NDArray[np.generic], group: Group, blur_px: float, band_blur_p
     return batch, ring_pixels(image, rings, batch.maps(group.poses, patches), patches, half, band_blur_px, fine)
 
 
-def coarse_fit(image: NDArray[np.generic], group: Group) -> Coarse:
+def coarse_fit(image: NDArray[Any], group: Group) -> Coarse:
     """Fit every fourth pixel of a wide band, first all of them, then without outliers."""
     batch, pixels = layout(image, group, FIRST_BLUR_PX, FIRST_BAND_BLUR_PX)
     # one pixel of each block of 2x2, and fewer blocks of large rings
@@ -221,7 +222,9 @@ def learn(camera: Camera, pattern: Pattern, start: Pose, coarse: list[Coarse], a
     centers = np.concatenate([centers_of(camera, c.group.poses, c.group.batch.curvature_per_mm)[0] for c in coarse])
     good = np.isfinite(centers).all(axis=1)
     pose = rigid_pose(pattern, index[good], camera, centers[good], start) if good.sum() >= 4 else start
-    noise = noise_model([c.pixels.grey for c in coarse], [c.adjusted.residual for c in coarse], [c.pixels.used for c in coarse], [False] * len(coarse))
+    noise = noise_model(
+        [c.pixels.grey for c in coarse], [c.adjusted.residual for c in coarse], [c.pixels.used for c in coarse], [False] * len(coarse)
+    )
     tone = shared_tone(coarse)
     if assumptions.normal_sigma_deg is not None:
         return Shared(pose, noise, max(np.radians(assumptions.normal_sigma_deg), LEAST_NORMAL_SIGMA_RAD), *tone)
@@ -231,7 +234,7 @@ def learn(camera: Camera, pattern: Pattern, start: Pose, coarse: list[Coarse], a
 
 
 def shared_tone(coarse: list[Coarse]) -> tuple[float, float]:
-    """log gamma of the photograph and its sigma, from all targets: one camera has one tone curve."""
+    """Log gamma of the photograph and its sigma, from all targets: one camera has one tone curve."""
     value = np.concatenate([c.adjusted.state.log_gamma for c in coarse])
     variance = np.concatenate([inverse_scaled(c.adjusted.information)[:, TONE, TONE] for c in coarse])
     good = np.isfinite(variance) & (variance > 0) & np.concatenate([c.adjusted.converged for c in coarse])
@@ -281,7 +284,7 @@ def normal_spread(tilt: Array, covariance: Array) -> float:
     return float(grid[np.argmax(likelihood)])
 
 
-def full_fit(image: NDArray[np.generic], pattern: Pattern, coarse: Coarse, shared: Shared) -> tuple[Group, Adjusted, RingPixels]:
+def full_fit(image: NDArray[Any], pattern: Pattern, coarse: Coarse, shared: Shared) -> tuple[Group, Adjusted, RingPixels]:
     """Fit all pixels of the band, with the photograph's noise and the surface's normals."""
     group = coarse.group
     expected = shared.camera_from_dish.rotate(pattern.normal[group.index])
@@ -312,4 +315,3 @@ def _without_bad_rings(coarse: Coarse, pixels: RingPixels) -> tuple[Array, RingP
     good = np.bincount(pixels.target, weights=~bad, minlength=len(per_target))
     drop = bad & (good[pixels.target] > 0)
     return coarse.cut, replace(pixels, used=pixels.used & ~drop[:, None])
-

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from dishmap.targets.pattern import Pattern, TargetKind
 from dishmap.targets.pixels import GEOMETRY, OFFSET_PX, State
 from dishmap.transforms import Pose, cross_matrix, rotation_from_vector
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 Index = NDArray[np.int64]
 
 ELLIPSE_POINTS = 12

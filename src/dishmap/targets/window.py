@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,7 +12,7 @@ from dishmap.targets.edges import LocalMaps, Patches, Poses, monomials
 from dishmap.targets.pattern import TargetKind, bent_print_mm
 from dishmap.targets.pixels import BAND_BLURS, BAND_EXTRA_PX, LARGEST_CURVED, RingPixels, Rings, rings_of
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 Index = NDArray[np.int64]
 
 OUTLINE_POINTS = 16
@@ -76,7 +78,9 @@ def ring_areas(kind: TargetKind, members: list[list[int]]) -> tuple[Array, Array
     return centers, np.array(reach)
 
 
-def ring_pixels(image: NDArray[np.generic], rings: Rings, maps: LocalMaps, patches: Patches, half_px: Array, blur_px: float, fine: bool) -> RingPixels:
+def ring_pixels(
+    image: NDArray[Any], rings: Rings, maps: LocalMaps, patches: Patches, half_px: Array, blur_px: float, fine: bool
+) -> RingPixels:
     """Pixels of the rings of T targets: the band along their edges, or their whole window for fine rings.
 
     half_px (M,): half the size of the ring's outline; `maps` are those of `patches`, one for each ring.
@@ -89,14 +93,16 @@ def ring_pixels(image: NDArray[np.generic], rings: Rings, maps: LocalMaps, patch
     return _bands(image, rings, maps, patches, ring, half, reach)
 
 
-def _gather(image: NDArray[np.generic], u: Index, v: Index) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _gather(image: NDArray[Any], u: Index, v: Index) -> tuple[NDArray[Any], NDArray[Any]]:
     height, width = image.shape
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     flat = np.clip(v, 0, height - 1) * width + np.clip(u, 0, width - 1)
     return np.take(image.reshape(-1), flat).astype(np.float32), inside
 
 
-def _whole_windows(image: NDArray[np.generic], rings: Rings, maps: LocalMaps, patches: Patches, ring: Index, half: int, reach: float) -> RingPixels:
+def _whole_windows(
+    image: NDArray[Any], rings: Rings, maps: LocalMaps, patches: Patches, ring: Index, half: int, reach: float
+) -> RingPixels:
     side = 2 * half + 1
     dv, du = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1)
     anchor = patches.anchor_px.astype(int)
@@ -107,7 +113,7 @@ def _whole_windows(image: NDArray[np.generic], rings: Rings, maps: LocalMaps, pa
     return RingPixels(ring, patches, s, t, grey, inside & _near_edges(rings, maps, ring, s, t, reach), (side, side))
 
 
-def _bands(image: NDArray[np.generic], rings: Rings, maps: LocalMaps, patches: Patches, ring: Index, half: Array, reach: float) -> RingPixels:
+def _bands(image: NDArray[Any], rings: Rings, maps: LocalMaps, patches: Patches, ring: Index, half: Array, reach: float) -> RingPixels:
     """Pixels within `reach` of any edge, chosen by 2x2 blocks; every k-th row and column for very large rings."""
     stride = int(np.ceil(2 * half.max() / LARGEST_WINDOW_PX))
     size = int(np.ceil(half.max() / stride / 2)) * 2
@@ -130,7 +136,7 @@ def _bands(image: NDArray[np.generic], rings: Rings, maps: LocalMaps, patches: P
     return RingPixels(ring, patches, out_u.astype(np.float32) / scale, out_v.astype(np.float32) / scale, grey, used & inside)
 
 
-def _near_edges(rings: Rings, maps: LocalMaps, ring: Index, s: NDArray[np.float32], t: NDArray[np.float32], reach_px: float) -> NDArray[np.bool_]:
+def _near_edges(rings: Rings, maps: LocalMaps, ring: Index, s: NDArray[Any], t: NDArray[Any], reach_px: float) -> NDArray[Any]:
     """Where points (M, n) lie within `reach_px` of an edge of their ring; to first order, which is enough to choose pixels."""
     six = maps.plane.astype(np.float32) @ monomials(s, t, maps.degree)
     x, y, xu, xv, yu, yv = (six[:, k] for k in range(6))

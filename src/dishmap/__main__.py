@@ -1,0 +1,5 @@
+"""`python -m dishmap` is `dishmap`."""
+
+from dishmap.cli.app import main
+
+main()

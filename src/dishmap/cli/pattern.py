@@ -1,0 +1,115 @@
+"""`dishmap pattern`: write the file of a pattern to be printed."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from dishmap.cli.options import POSITIVE, F, Number, Numbers, out_file
+from dishmap.cli.terminal import say
+
+if TYPE_CHECKING:
+    from dishmap.targets.pattern import Pattern, TargetKind
+
+# A test holds these to `dishmap.targets.builders.KIND_BUILDERS`, which is not loaded for the sake of a help text.
+KINDS = ("disc", "ring", "concentric", "multi", "whycon")
+
+
+def _kind_options(command: F) -> F:
+    options = [
+        click.option(
+            "--kind", type=click.Choice(KINDS), default="multi", show_default=True, help="Kind of target; multi is a group of rings."
+        ),
+        click.option("--radius-mm", type=POSITIVE, help="Of a disc.  [default: 5]"),
+        click.option("--outer-radius-mm", type=POSITIVE, help="Of a ring.  [default: 5; whycon: 6]"),
+        click.option("--inner-radius-mm", type=Number(-1e-12), help="Of a ring; 0 makes multi a group of discs.  [default: 3]"),
+        click.option("--ratio", type=Number(0.0, 1.0), help="Inner over outer radius of whycon.  [default: 0.41]"),
+        click.option("--radii-mm", type=Numbers(), metavar="R,R,...", help="Of concentric circles.  [default: 10,8,6,4]"),
+        click.option("--count", type=click.IntRange(1, 12), help="Rings of multi.  [default: 4]"),
+        click.option("--side-mm", type=POSITIVE, help="Side of the polygon on whose corners the rings of multi lie.  [default: 14]"),
+        click.option("--orientation-marks", is_flag=True, help="Let a few targets look different, so that no turn is ambiguous."),
+        click.option("--name", default="", help="Name of the pattern, written into the file."),
+        out_file("Pattern file (JSON)"),
+    ]
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+@click.group("pattern")
+def pattern_group() -> None:
+    """Write a pattern file: what is printed, and where."""
+
+
+@pattern_group.command("plate")
+@click.option("--rows", type=click.IntRange(1), required=True, help="Rows of targets.")
+@click.option("--columns", type=click.IntRange(1), required=True, help="Columns of targets.")
+@click.option("--pitch-mm", type=POSITIVE, required=True, help="From target to target, both ways.")
+@_kind_options
+def plate_command(rows: int, columns: int, pitch_mm: float, orientation_marks: bool, name: str, out: Path, **kind: Any) -> None:
+    """A flat plate of targets on a square lattice."""
+    from dishmap.targets.builders import plate
+
+    target, kind_name = _kind(**kind)
+    _write(plate(rows, columns, pitch_mm, target, kind_name, orientation_marks, name), out)
+
+
+@pattern_group.command("dish")
+@click.option("--diameter-mm", type=POSITIVE, required=True, help="Of the rim.")
+@click.option("--focal-length-mm", type=POSITIVE, required=True, help="Of the paraboloid.")
+@click.option("--spacing-mm", type=POSITIVE, default=45.0, show_default=True, help="From circle to circle, and along each.")
+@click.option("--margin-mm", type=Number(), help="From the outermost targets' centres to the rim.  [default: the targets' radius]")
+@click.option("--no-center-target", is_flag=True, help="Leave the vertex free.")
+@_kind_options
+def dish_command(
+    diameter_mm: float,
+    focal_length_mm: float,
+    spacing_mm: float,
+    margin_mm: float | None,
+    no_center_target: bool,
+    orientation_marks: bool,
+    name: str,
+    out: Path,
+    **kind: Any,
+) -> None:
+    """A paraboloid with targets on concentric circles."""
+    from dishmap.targets.builders import dish
+
+    target, kind_name = _kind(**kind)
+    pattern = dish(diameter_mm, focal_length_mm, spacing_mm, target, kind_name, orientation_marks, margin_mm, not no_center_target, name)
+    _write(pattern, out)
+
+
+def _kind(kind: str, **sizes: Any) -> tuple[TargetKind, str]:
+    """The kind of target that the options describe, and its name. A size that this kind does not have is a usage error."""
+    from dishmap.targets.builders import KIND_BUILDERS
+
+    build = KIND_BUILDERS[kind]
+    given = {name: value for name, value in sizes.items() if value is not None}
+    takes = list(inspect.signature(build).parameters)
+    for name in given:
+        if name not in takes:
+            raise click.UsageError(f"{_word(name)} is no size of --kind {kind}, which takes {', '.join(map(_word, takes))}")
+    count = given.get("count", inspect.signature(build).parameters["count"].default) if kind == "multi" else ""
+    return build(**given), f"{kind}{count}"
+
+
+def _word(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _write(pattern: Pattern, out: Path) -> None:
+    from dishmap.io.pattern_file import write_pattern
+    from dishmap.targets.symmetry import symmetry_poses
+
+    write_pattern(out, pattern)
+    say(f"{out}: {len(pattern)} targets ({', '.join(pattern.kinds)})")
+    same = len(symmetry_poses(pattern))
+    if same:
+        say(
+            f"  the pattern looks the same after {same} turn{'s' * (same > 1)}, so `dishmap map` needs --upright or --pose-guess; "
+            "--orientation-marks avoids that"
+        )

@@ -1,0 +1,320 @@
+"""The report of a map, and of a calibration: one HTML page that works offline, can be printed, and says first what matters.
+
+The same input gives the same page, byte for byte, with the same versions of the libraries that are listed at its end.
+"""
+
+from __future__ import annotations
+
+import platform
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import dishmap
+from dishmap.camera.model import Camera
+from dishmap.camera.uncertainty import projection_error
+from dishmap.page import bullet_list, charts, fact_grid, figure, page, paragraph, script_json, section, table, verdict_box
+from dishmap.pipeline import Map
+from dishmap.plot.canvas import round_length
+from dishmap.plot.maps import normals_map, ratio_histogram, residual_map, sigma_map
+from dishmap.plot.outlines import check_picture, outlines_of, unused_outlines
+from dishmap.plot.photograph import error_svg, photograph_svg
+from dishmap.quality import MEANING, names
+from dishmap.surface.fit import SurfaceFit, surface_heights
+from dishmap.verdict import Numbers, Verdict, number, numbers_of, rejected_targets, targets, unused_marks, verdict_of
+
+Array = NDArray[np.float64]
+
+LIBRARIES = ("numpy", "scipy", "cv2", "matplotlib", "plotly")
+# Rings and spokes of the surface in the 3D picture: smooth to the eye, and 40 kB.
+RINGS, SPOKES = 24, 73
+# Residuals are drawn so that the largest takes about this part of the surface's width.
+EXAGGERATED_PART = 0.08
+# Where the eye stands, in units of the scene's size: a little above the rim.
+EYE = {"x": 0.95, "y": -1.7, "z": 1.15}
+PLOTLY_DIVERGING = [[0.0, "#053061"], [0.25, "#6aacd0"], [0.5, "#f7f7f7"], [0.75, "#e58368"], [1.0, "#67001f"]]
+# Rows and columns of the circles of the paper's Fig. 1.
+FIGURE_1_GRID = (9, 12)
+
+
+def map_report(result: Map, image: NDArray[np.generic], title: str, inputs: dict[str, str]) -> str:
+    """The report of a map as one HTML page.
+
+    image: the picture (H, W) that was measured, grey: the photograph, or for the method `paper` the undistorted one.
+    title: the page's heading; inputs: what the map was made from, by name, listed at its end.
+    Raises ImageError when the picture does not have the size of `result.camera`.
+    """
+    check_picture(image, result.camera)
+    numbers = numbers_of(result)
+    verdict = verdict_of(result, numbers)
+    body = [
+        *_verdict(verdict),
+        _photograph(result, numbers, image),
+        _surface(result, numbers),
+        _targets(result, numbers),
+        _calibration_error(result.camera, with_picture=True),
+        _quality(result),
+        _table(result, numbers),
+        _inputs(inputs),
+    ]
+    return page(title, body, _scripts(result, numbers))
+
+
+def _verdict(verdict: Verdict) -> list[str]:
+    parts = [verdict_box(verdict.headline, bool(verdict.warnings)), fact_grid((f.name, f.value, f.detail) for f in verdict.facts)]
+    return [*parts, section("What to know", bullet_list(verdict.warnings))] if verdict.warnings else parts
+
+
+def _photograph(result: Map, numbers: Numbers, image: NDArray[np.generic]) -> str:
+    outlines = [*unused_outlines(result), *outlines_of(result, numbers)]
+    lost = rejected_targets(result)
+    alt = f"The photograph with {targets(len(result.cloud))} outlined, {len(lost)} rejected and {len(result.missing)} not seen."
+    how = "coloured by the sigma of its depth" if numbers.sigma_depth_mm is not None else "in blue, since the method gives no sigmas"
+    rest = " Red and dashed with a cross: seen but rejected." if lost else ""
+    rest += " White and dashed: where a target that was not seen would be, were the surface undeformed." if result.missing else ""
+    rest += " Thin dotted red: looks like a mark, but is not one of the pattern." if result.identity.rejected else ""
+    caption = f"Each measured target is outlined as it was found, {how}, with its id.{rest} Hovering over a target tells more."
+    svg = photograph_svg(image, outlines, "sigma of depth (mm), photograph's noise alone", alt)
+    listed = [(str(i), reason) for i, reason in lost] + [(f"{count} without id", reason) for reason, count in unused_marks(result).items()]
+    rejected = table(("target", "seen but not used, because"), listed, (0, 1)) if listed else ""
+    return section("Photograph", figure(svg, caption), rejected)
+
+
+def _surface(result: Map, numbers: Numbers) -> str:
+    fit = result.surface
+    if fit is None:
+        return section("Surface", paragraph(f"No surface was fitted: {result.surface_problem}"))
+    xy = numbers.dish.position_mm[:, :2]
+    space = '<div id="surface3d" class="plot3d" role="img" aria-label="Interactive picture of the fitted surface with the targets."></div>'
+    caption = (
+        "The fitted surface with the targets, in the dish frame; turn it with the mouse. Residuals are drawn "
+        f"{_exaggeration(fit, xy):g} times enlarged, or at true scale, as chosen above it. Hovering tells id, position and sigma."
+    )
+    return section(
+        "Surface",
+        charts(_residual_figure(numbers, fit), _ratio_figure(numbers, fit)),
+        f"<figure>{space}<figcaption>{caption}</figcaption></figure>",
+        _coefficients(fit),
+    )
+
+
+def _residual_figure(numbers: Numbers, fit: SurfaceFit) -> str:
+    along = "the surface's normal" if fit.basis.kind == "paraboloid" else "z of the dish frame"
+    return figure(
+        residual_map(numbers.dish.position_mm[:, :2], fit.residual_mm, fit.off_surface, fit.ids, "residual (mm)"),
+        f"Residual of each target: its distance from the fitted {fit.basis.kind} along {along}, positive towards the camera's side. "
+        "Dish frame, seen from that side.",
+        f"Map of residuals to the surface, {number(fit.rms_mm)} mm rms.",
+    )
+
+
+def _ratio_figure(numbers: Numbers, fit: SurfaceFit) -> str:
+    if numbers.ratio is None or fit.noise_factor is None:
+        return ""
+    return figure(
+        ratio_histogram(numbers.ratio, fit.noise_factor),
+        f"Residuals over their claimed sigmas; their robust spread is {number(fit.noise_factor)}. Near 1, the targets' noise explains "
+        "them; well above, the surface has shape that the fit does not follow. The outermost bars hold what lies beyond.",
+        f"Histogram of residual over sigma, spread {number(fit.noise_factor)}.",
+    )
+
+
+def _targets(result: Map, numbers: Numbers) -> str:
+    xy, first, why = numbers.dish.position_mm[:, :2], "", ""
+    if numbers.sigma_depth_mm is None:
+        why = paragraph("The paper's method gives no uncertainty, so there is no map of sigmas.")
+    else:
+        first = figure(
+            sigma_map(xy, numbers.sigma_depth_mm, "sigma of depth (mm)"),
+            "Sigma of each target's depth (along the camera's axis), from the photograph's noise alone.",
+            f"Map of depth sigmas, median {number(float(np.median(numbers.sigma_depth_mm)))} mm.",
+        )
+    reference = "fitted surface's normal" if result.surface else "pattern's nominal normal"
+    angle = np.degrees(numbers.lean_angle_rad)
+    claimed = ""
+    if numbers.sigma_depth_mm is not None:
+        claimed = f", where the median claimed sigma is {number(float(np.degrees(np.median(result.cloud.sigma_normal_rad))))}°"
+    second = figure(
+        normals_map(xy, numbers.lean_rad, reference),
+        f"Lean of each measured normal from the {reference}; median {number(float(np.median(angle)))}°{claimed}.",
+        f"Arrows of normals against the {reference}, median {number(float(np.median(angle)))} degrees.",
+    )
+    return section("Depth and normals", why, charts(first, second))
+
+
+def _coefficients(fit: SurfaceFit) -> str:
+    own = np.sqrt(np.diag(fit.covariance))
+    shared = None if fit.calibration_covariance is None else np.sqrt(np.diag(fit.calibration_covariance))
+    heads = ["coefficient", "value", "sigma, noise", *([] if shared is None else ["sigma, calibration"]), "unit"]
+    rows = []
+    for i, name in enumerate(fit.names):
+        sigmas = [number(float(own[i])), *([] if shared is None else [number(float(shared[i]))])]
+        rows.append([name, f"{fit.coefficients[i]:.6g}", *sigmas, fit.units[i]])
+    return f"<h3>Coefficients of the {fit.basis.kind} (dish frame)</h3>" + table(heads, rows, (0, len(heads) - 1))
+
+
+def _calibration_error(camera: Camera, with_picture: bool) -> str:
+    heading = "Expected projection error of the camera"
+    if camera.covariance is None:
+        return section(heading, paragraph("Not known: the camera file carries no covariance. `dishmap calibrate` writes one that does."))
+    error = projection_error(camera, FIGURE_1_GRID)
+    shape = projection_error(camera, FIGURE_1_GRID, remove_rotation=True)
+    summary = f"{number(error.rms_px)} px rms over the picture"
+    svg = error_svg(error, camera.width_px, camera.height_px, f"Map of the expected projection error, {summary}.", with_picture)
+    caption = (
+        f"Radius of each circle: the error to be expected where a known direction is projected, from the calibration's covariance; {summary}. "
+        f"A small turn of the camera explains most of it as a rule: without the turn that fits best, {number(shape.rms_px)} px rms are left."
+    )
+    return section(heading, figure(svg, caption))
+
+
+def _quality(result: Map) -> str:
+    bits = result.cloud.quality
+    rows = [(str(flag.name).lower(), str(int(((bits & int(flag)) != 0).sum())), meaning) for flag, meaning in MEANING.items()]
+    rows = [row for row in rows if row[1] != "0"]
+    clean = paragraph(f"{int((bits == 0).sum())} of {targets(len(bits))} measured are clean, that is without a flag.")
+    return section("Quality", clean, table(("flag", "targets", "meaning"), rows, (0, 2)) if rows else "")
+
+
+def _table(result: Map, numbers: Numbers) -> str:
+    cloud, fit = result.cloud, result.surface
+    heads = ["id", "x (mm)", "y (mm)", "z (mm)", "nx", "ny", "nz", "u (px)", "v (px)"]
+    columns = [[str(i) for i in cloud.ids.tolist()]]
+    columns += [[f"{value:.3f}" for value in cloud.position_mm[:, i]] for i in range(3)]
+    columns += [[f"{value:.4f}" for value in cloud.normal[:, i]] for i in range(3)]
+    columns += [[f"{value:.3f}" for value in cloud.center_px[:, i]] for i in range(2)]
+    if numbers.sigma_depth_mm is not None:
+        heads += ["σ z (mm)", "σ normal (°)"]
+        columns += [[number(float(s)) for s in numbers.sigma_depth_mm], [number(float(s)) for s in np.degrees(cloud.sigma_normal_rad)]]
+    if fit is not None:
+        heads.append("residual (mm)")
+        columns.append([f"{value:.4f}" for value in fit.residual_mm])
+    heads.append("flags")
+    columns.append([names(int(q)).replace("|", ", ") for q in cloud.quality])
+    about = paragraph("Positions and normals in the camera frame (x right, y down, z forward); u, v is the projection of the target's centre.")
+    return section("All measured targets", about, table(heads, zip(*columns, strict=True), (len(heads) - 1,)))
+
+
+def _inputs(inputs: dict[str, str]) -> str:
+    versions = [("dishmap", dishmap.__version__), ("Python", platform.python_version())]
+    versions += [(name, str(import_module(name).__version__)) for name in LIBRARIES]
+    rows = [*((str(k), str(v)) for k, v in inputs.items()), *((f"version of {name}", version) for name, version in versions)]
+    return section("Inputs and versions", table(("what", "value"), rows, (0, 1)))
+
+
+def _exaggeration(fit: SurfaceFit, xy_mm: Array) -> float:
+    """A round factor by which residuals are enlarged in the 3D picture, 1 or more."""
+    largest = float(np.abs(fit.residual_mm[~fit.off_surface]).max(initial=0.0))
+    return max(1.0, round_length(EXAGGERATED_PART * float(np.ptp(xy_mm, axis=0).max()) / largest)) if largest > 0 else 1.0
+
+
+def _scripts(result: Map, numbers: Numbers) -> list[str]:
+    """plotly and the call that draws the 3D picture; nothing without a surface."""
+    if result.surface is None:
+        return []
+    from plotly.offline import get_plotlyjs
+
+    data, layout = _scene(result, numbers, result.surface)
+    config = {"displaylogo": False, "responsive": True, "modeBarButtons": [["zoom3d", "pan3d", "orbitRotation", "resetCameraDefault3d"]]}
+    call = f'Plotly.newPlot("surface3d",{script_json(data)},{script_json(layout)},{script_json(config)});'
+    return [get_plotlyjs(), call]
+
+
+def _scene(result: Map, numbers: Numbers, fit: SurfaceFit) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Traces and layout of the 3D picture: the surface, and the residuals twice, enlarged and at true scale."""
+    position = numbers.dish.position_mm
+    factor = _exaggeration(fit, position[:, :2])
+    on = position[:, 2] - fit.residual_mm
+    height = surface_heights(fit, position[:, 0], position[:, 1]).height_mm
+    foot = np.where(np.isfinite(height), height, on)
+    traces = [_mesh(fit)]
+    for times in (factor, 1.0):
+        top = foot + times * (position[:, 2] - foot)
+        traces += _stems(result, numbers, fit, foot, top, visible=times == factor)
+    choices = [
+        {"label": label, "method": "restyle", "args": [{"visible": [True, *shown, *(not s for s in shown)]}]}
+        for label, shown in ((f"residuals {factor:g} times enlarged", (True, True)), ("true scale", (False, False)))
+    ]
+    font = {"family": "system-ui, DejaVu Sans, Arial, sans-serif", "size": 13, "color": "#1a1a1a"}
+    layout = {
+        "margin": {"l": 0, "r": 0, "t": 40, "b": 0},
+        "font": font,
+        "paper_bgcolor": "#ffffff",
+        "showlegend": False,
+        "scene": {**{f"{a}axis": {"title": {"text": f"{a} (mm)"}} for a in "xyz"}, "aspectmode": "data", "camera": {"eye": EYE, "center": {"x": 0, "y": 0, "z": -0.2}}},
+        "updatemenus": [{"type": "buttons", "direction": "right", "x": 0, "xanchor": "left", "y": 1.06, "yanchor": "top", "buttons": choices}],
+    }
+    return traces, layout
+
+
+def _mesh(fit: SurfaceFit) -> dict[str, Any]:
+    """The fitted surface within the outline of its points, on rings from the middle outwards."""
+    middle = fit.hull_mm.mean(axis=0)
+    angle = np.linspace(0.0, 2 * np.pi, SPOKES)
+    direction = np.column_stack([np.cos(angle), np.sin(angle)])
+    edge = np.roll(fit.hull_mm, -1, axis=0) - fit.hull_mm
+    outward = np.column_stack([edge[:, 1], -edge[:, 0]])
+    # a spoke ends at the first edge of the convex outline that it meets
+    speed = direction @ outward.T
+    room = np.where(speed > 1e-12, ((fit.hull_mm - middle) * outward).sum(axis=1) / np.where(speed > 1e-12, speed, 1.0), np.inf)
+    spokes = direction * room.min(axis=1)[:, None]
+    x, y = np.moveaxis(middle + np.linspace(0.0, 1.0, RINGS)[:, None, None] * spokes, -1, 0)
+    height = surface_heights(fit, x, y).height_mm
+    return {
+        "type": "surface",
+        "x": _listed(x, 2),
+        "y": _listed(y, 2),
+        "z": _listed(height, 4),
+        "showscale": False,
+        "opacity": 0.85,
+        "colorscale": [[0, "#6fa8cf"], [1, "#d3e5f2"]],
+        "hoverinfo": "skip",
+        "contours": {axis: {"highlight": False} for axis in "xyz"},
+    }
+
+
+def _stems(result: Map, numbers: Numbers, fit: SurfaceFit, foot: Array, top: Array, visible: bool) -> list[dict[str, Any]]:
+    """Lines from the surface to the targets, and the targets as dots coloured by residual."""
+    x, y, _ = numbers.dish.position_mm.T
+    gap = np.full_like(x, np.nan)
+    line = [_listed(np.column_stack(three).ravel(), 4) for three in ((x, x, gap), (y, y, gap), (foot, top, gap))]
+    limit = float(np.abs(fit.residual_mm[~fit.off_surface]).max(initial=0.0)) or 1.0
+    dots = {
+        "color": _listed(fit.residual_mm, 5),
+        "colorscale": PLOTLY_DIVERGING,
+        "cmin": -limit,
+        "cmax": limit,
+        "size": 4.5,
+        "line": {"color": "#1a1a1a", "width": 1},
+        "colorbar": {"title": {"text": "residual (mm)"}, "thickness": 16, "len": 0.7},
+    }
+    return [
+        {
+            **{"type": "scatter3d", "mode": "lines", "visible": visible, "hoverinfo": "skip"},
+            **{"x": line[0], "y": line[1], "z": line[2], "line": {"color": "#555555", "width": 3}},
+        },
+        {
+            **{"type": "scatter3d", "mode": "markers", "visible": visible, "marker": dots},
+            **{"x": _listed(x, 4), "y": _listed(y, 4), "z": _listed(top, 4)},
+            **{"text": _hover_texts(result, numbers, fit), "hovertemplate": "%{text}<extra></extra>"},
+        },
+    ]
+
+
+def _hover_texts(result: Map, numbers: Numbers, fit: SurfaceFit) -> list[str]:
+    out = []
+    for n, (x, y, z) in enumerate(numbers.dish.position_mm.tolist()):
+        lines = [f"target {result.cloud.ids[n]}", f"x {x:.3f}, y {y:.3f}, z {z:.3f} mm (dish frame)", f"residual {fit.residual_mm[n]:.4f} mm"]
+        if numbers.sigma_depth_mm is not None:
+            lines.append(f"sigma of depth {number(float(numbers.sigma_depth_mm[n]))} mm")
+        out.append("<br>".join(lines))
+    return out
+
+
+def _listed(values: Array, digits: int) -> list[Any]:
+    """Nested lists of rounded numbers, None for NaN, for JSON."""
+    rounded = np.round(values, digits).astype(object)
+    rounded[~np.isfinite(values)] = None
+    return list(rounded.tolist())
