@@ -61,9 +61,10 @@ def rms(values: Array) -> float:
 class Errors:
     """Measured minus true of N targets, with the sigmas that were claimed.
 
-    position_mm (N, 3); center_px (N, 2); normal_rad (N,) angle; the three claimed sigmas alike; quality (N,).
+    ids (N,); position_mm (N, 3); center_px (N, 2); normal_rad (N,) angle; the three claimed sigmas alike; quality (N,).
     """
 
+    ids: NDArray[np.int64]
     position_mm: Array
     center_px: Array
     normal_rad: Array
@@ -87,6 +88,7 @@ def errors_of(result: Map, truth: Truth) -> Errors:
     row = {int(ident): i for i, ident in enumerate(truth.ids)}
     index = np.array([row[int(ident)] for ident in cloud.ids], dtype=np.int64)
     return Errors(
+        cloud.ids,
         cloud.position_mm - truth.center_mm[index],
         cloud.center_px - truth.center_px[index],
         angle_between_rad(cloud.normal, truth.normal[index]),

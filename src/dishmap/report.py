@@ -20,7 +20,7 @@ from dishmap.pipeline import Map
 from dishmap.plot.canvas import round_length
 from dishmap.plot.maps import normals_map, ratio_histogram, residual_map, sigma_map
 from dishmap.plot.outlines import check_picture, outlines_of, unused_outlines
-from dishmap.plot.photograph import error_svg, photograph_svg
+from dishmap.plot.photograph import error_svg, photograph_frame, photograph_svg
 from dishmap.quality import MEANING, names
 from dishmap.surface.fit import SurfaceFit, surface_heights
 from dishmap.verdict import Numbers, Verdict, number, numbers_of, rejected_targets, targets, unused_marks, verdict_of
@@ -33,7 +33,8 @@ RINGS, SPOKES = 24, 73
 # Residuals are drawn so that the largest takes about this part of the surface's width.
 EXAGGERATED_PART = 0.08
 # Where the eye stands, in units of the scene's size: a little above the rim.
-EYE = {"x": 0.95, "y": -1.7, "z": 1.15}
+EYE = {"x": 0.6, "y": -1.15, "z": 0.8}
+SCENE_MARGIN = 0.04
 PLOTLY_DIVERGING = [[0.0, "#053061"], [0.25, "#6aacd0"], [0.5, "#f7f7f7"], [0.75, "#e58368"], [1.0, "#67001f"]]
 # Rows and columns of the circles of the paper's Fig. 1.
 FIGURE_1_GRID = (9, 12)
@@ -54,7 +55,7 @@ def map_report(result: Map, image: NDArray[np.generic], title: str, inputs: dict
         _photograph(result, numbers, image),
         _surface(result, numbers),
         _targets(result, numbers),
-        _calibration_error(result.camera, with_picture=True),
+        _calibration_error(result.camera, image),
         _quality(result),
         _table(result, numbers),
         _inputs(inputs),
@@ -75,8 +76,10 @@ def _photograph(result: Map, numbers: Numbers, image: NDArray[np.generic]) -> st
     rest = " Red and dashed with a cross: seen but rejected." if lost else ""
     rest += " White and dashed: where a target that was not seen would be, were the surface undeformed." if result.missing else ""
     rest += " Thin dotted red: looks like a mark, but is not one of the pattern." if result.identity.rejected else ""
-    caption = f"Each measured target is outlined as it was found, {how}, with its id.{rest} Hovering over a target tells more."
-    svg = photograph_svg(image, outlines, "sigma of depth (mm), photograph's noise alone", alt)
+    frame = photograph_frame(image, outlines)
+    part = f"Columns {frame.columns[0]} to {frame.columns[1] - 1}, rows {frame.rows[0]} to {frame.rows[1] - 1} of the photograph."
+    caption = f"{part} Each measured target is outlined as it was found, {how}, with its id.{rest} Hovering over a target tells more."
+    svg = photograph_svg(image, frame, outlines, "sigma of depth (mm)", alt)
     listed = [(str(i), reason) for i, reason in lost] + [(f"{count} without id", reason) for reason, count in unused_marks(result).items()]
     rejected = table(("target", "seen but not used, because"), listed, (0, 1)) if listed else ""
     return section("Photograph", figure(svg, caption), rejected)
@@ -155,14 +158,14 @@ def _coefficients(fit: SurfaceFit) -> str:
     return f"<h3>Coefficients of the {fit.basis.kind} (dish frame)</h3>" + table(heads, rows, (0, len(heads) - 1))
 
 
-def _calibration_error(camera: Camera, with_picture: bool) -> str:
+def _calibration_error(camera: Camera, image: NDArray[np.generic] | None) -> str:
     heading = "Expected projection error of the camera"
     if camera.covariance is None:
         return section(heading, paragraph("Not known: the camera file carries no covariance. `dishmap calibrate` writes one that does."))
     error = projection_error(camera, FIGURE_1_GRID)
     shape = projection_error(camera, FIGURE_1_GRID, remove_rotation=True)
     summary = f"{number(error.rms_px)} px rms over the picture"
-    svg = error_svg(error, camera.width_px, camera.height_px, f"Map of the expected projection error, {summary}.", with_picture)
+    svg = error_svg(error, camera.width_px, camera.height_px, f"Map of the expected projection error, {summary}.", image)
     caption = (
         f"Radius of each circle: the error to be expected where a known direction is projected, from the calibration's covariance; {summary}. "
         f"A small turn of the camera explains most of it as a rule: without the turn that fits best, {number(shape.rms_px)} px rms are left."
@@ -193,7 +196,9 @@ def _table(result: Map, numbers: Numbers) -> str:
         columns.append([f"{value:.4f}" for value in fit.residual_mm])
     heads.append("flags")
     columns.append([names(int(q)).replace("|", ", ") for q in cloud.quality])
-    about = paragraph("Positions and normals in the camera frame (x right, y down, z forward); u, v is the projection of the target's centre.")
+    about = paragraph(
+        "Positions and normals in the camera frame (x right, y down, z forward); u, v is the projection of the target's centre."
+    )
     return section("All measured targets", about, table(heads, zip(*columns, strict=True), (len(heads) - 1,)))
 
 
@@ -243,10 +248,24 @@ def _scene(result: Map, numbers: Numbers, fit: SurfaceFit) -> tuple[list[dict[st
         "font": font,
         "paper_bgcolor": "#ffffff",
         "showlegend": False,
-        "scene": {**{f"{a}axis": {"title": {"text": f"{a} (mm)"}} for a in "xyz"}, "aspectmode": "data", "camera": {"eye": EYE, "center": {"x": 0, "y": 0, "z": -0.2}}},
-        "updatemenus": [{"type": "buttons", "direction": "right", "x": 0, "xanchor": "left", "y": 1.06, "yanchor": "top", "buttons": choices}],
+        "scene": _axes_of_scene(position[:, :2], np.concatenate([foot, foot + factor * (position[:, 2] - foot)])),
+        "updatemenus": [
+            {"type": "buttons", "direction": "right", "x": 0, "xanchor": "left", "y": 1.06, "yanchor": "top", "buttons": choices}
+        ],
     }
     return traces, layout
+
+
+def _axes_of_scene(xy_mm: Array, z_mm: Array) -> dict[str, Any]:
+    """Axes with one scale for x, y and z, the longest of length 1."""
+    low, high = np.array([*xy_mm.min(axis=0), z_mm.min()]), np.array([*xy_mm.max(axis=0), z_mm.max()])
+    low, high = low - SCENE_MARGIN * (high - low).max(), high + SCENE_MARGIN * (high - low).max()
+    axes: dict[str, Any] = {
+        f"{name}axis": {"title": {"text": f"{name} (mm)"}, "range": [round(float(a), 3), round(float(b), 3)]}
+        for name, a, b in zip("xyz", low, high, strict=True)
+    }
+    ratio = {name: round(float(length), 4) for name, length in zip("xyz", (high - low) / (high - low).max(), strict=True)}
+    return {**axes, "aspectmode": "manual", "aspectratio": ratio, "camera": {"eye": EYE, "center": {"x": 0, "y": 0, "z": -0.1}}}
 
 
 def _mesh(fit: SurfaceFit) -> dict[str, Any]:
@@ -306,7 +325,11 @@ def _stems(result: Map, numbers: Numbers, fit: SurfaceFit, foot: Array, top: Arr
 def _hover_texts(result: Map, numbers: Numbers, fit: SurfaceFit) -> list[str]:
     out = []
     for n, (x, y, z) in enumerate(numbers.dish.position_mm.tolist()):
-        lines = [f"target {result.cloud.ids[n]}", f"x {x:.3f}, y {y:.3f}, z {z:.3f} mm (dish frame)", f"residual {fit.residual_mm[n]:.4f} mm"]
+        lines = [
+            f"target {result.cloud.ids[n]}",
+            f"x {x:.3f}, y {y:.3f}, z {z:.3f} mm (dish frame)",
+            f"residual {fit.residual_mm[n]:.4f} mm",
+        ]
         if numbers.sigma_depth_mm is not None:
             lines.append(f"sigma of depth {number(float(numbers.sigma_depth_mm[n]))} mm")
         out.append("<br>".join(lines))

@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 
 # Above this, what is left over the surface is not explained by the targets' noise; below its inverse, sigmas are too large.
 LARGE_FACTOR = 1.5
+# From so few targets the factor itself is too uncertain to speak of.
+FEWEST_FOR_FACTOR = 20
 # A slope is taken over this part of the cloud's size.
 SLOPE_STEP = 1e-4
 # So many ids are written out in a sentence.
@@ -151,7 +153,9 @@ def _headline(result: Map) -> str:
     count = f"All {targets(total)} measured" if found == total else f"{found} of {targets(total)} measured"
     parts = [f"{lost} seen but rejected" if lost else "", f"{len(result.missing)} not seen" if result.missing else ""]
     rest = ", ".join(part for part in parts if part)
-    surface = f"the {_surface_name(result)} fits to {number(result.surface.rms_mm)} mm rms" if result.surface else "no surface could be fitted"
+    surface = (
+        f"the {_surface_name(result)} fits to {number(result.surface.rms_mm)} mm rms" if result.surface else "no surface could be fitted"
+    )
     return f"{count}{'; ' + rest if rest else ''}; {surface}."
 
 
@@ -167,7 +171,9 @@ def _facts(result: Map, numbers: Numbers) -> list[Fact]:
     facts = [Fact("Targets measured", f"{found} of {total}", f"{lost} rejected, {len(result.missing)} not seen")]
     if numbers.sigma_depth_mm is not None:
         sigma = numbers.sigma_depth_mm
-        facts.append(Fact("Depth sigma, median", f"{number(float(np.median(sigma)))} mm", f"{spread(sigma, ' mm')}; photograph's noise alone"))
+        facts.append(
+            Fact("Depth sigma, median", f"{number(float(np.median(sigma)))} mm", f"{spread(sigma, ' mm')}; photograph's noise alone")
+        )
         sigma_deg = np.degrees(result.cloud.sigma_normal_rad)
         facts.append(Fact("Normal sigma, median", f"{number(float(np.median(sigma_deg)))}°", spread(sigma_deg, "°")))
     if numbers.calibration_depth_mm is not None:
@@ -218,6 +224,11 @@ def _surface_warnings(result: Map) -> list[str]:
     if fit.noise_factor is not None and fit.noise_factor > LARGE_FACTOR:
         out.append(
             f"Residuals are {number(fit.noise_factor)} times what the claimed sigmas allow: the surface has a shape that this "
-            f"{_surface_name(result)} does not follow (see the residual map), which the robust rms includes."
+            f"{_surface_name(result)} does not follow (see the residual map)."
+        )
+    if fit.noise_factor is not None and fit.noise_factor * LARGE_FACTOR < 1 and len(fit.ids) >= FEWEST_FOR_FACTOR:
+        out.append(
+            f"Residuals are only {number(fit.noise_factor)} of the claimed sigmas: these hold a part that neighbours share, such as the "
+            "ink spread of lone discs, or they are too large."
         )
     return out

@@ -10,7 +10,7 @@ import functools
 import io
 import re
 from collections.abc import Callable
-from typing import ParamSpec
+from typing import Literal, ParamSpec
 
 import matplotlib
 import numpy as np
@@ -56,9 +56,9 @@ def as_svg(draw: Callable[P, Figure]) -> Callable[P, str]:
     return wrapped
 
 
-def new_figure(width_in: float, height_in: float) -> tuple[Figure, Axes]:
-    """A figure with one pair of axes, laid out so that no label is cut."""
-    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+def new_figure(width_in: float, height_in: float, layout: Literal["constrained", "compressed"] = "constrained") -> tuple[Figure, Axes]:
+    """A figure with one pair of axes, laid out so that no label is cut; `compressed` suits axes of fixed aspect."""
+    figure = Figure(figsize=(width_in, height_in), layout=layout)
     return figure, figure.subplots()
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import Normalize
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
 from dishmap.plot.canvas import BLUE, DIVERGING, FAINT, INK, ORANGE, RED, SEQUENTIAL, Array, as_svg, color_norm, new_figure, round_length
 
-MAP_IN = (6.2, 5.2)
+MAP_WIDTH_IN, MAP_BODY_IN, MAP_HEIGHTS_IN = 6.2, 4.6, (1.2, 6.0)
 CHART_IN = (6.2, 4.4)
 LEVELS = 20
 # Names beside points stay readable up to so many.
@@ -29,7 +29,7 @@ POINTS_PER_BIN, FEWEST_BINS, MOST_BINS = 6, 8, 40
 @as_svg
 def residual_map(xy_mm: Array, residual_mm: Array, off: NDArray[np.bool_], ids: NDArray[np.int64], label: str) -> Figure:
     """Residuals (N,) to the surface at points (N, 2), on a scale that is symmetric about zero; points off the surface as crosses."""
-    figure, axes = new_figure(*MAP_IN)
+    figure, axes = _map_figure(xy_mm)
     on = ~off
     largest = float(np.abs(residual_mm[on]).max()) if on.any() else 0.0
     largest = largest or float(np.abs(residual_mm).max()) or 1.0
@@ -41,7 +41,7 @@ def residual_map(xy_mm: Array, residual_mm: Array, off: NDArray[np.bool_], ids: 
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderpad=0.0)
         if off.sum() <= MOST_NAMES:
             _name(axes, xy_mm[off], ids[off])
-    figure.colorbar(dots, ax=axes, label=label, shrink=0.9)
+    figure.colorbar(dots, ax=axes, label=label)
     _dish_axes(axes, xy_mm)
     return figure
 
@@ -49,11 +49,15 @@ def residual_map(xy_mm: Array, residual_mm: Array, off: NDArray[np.bool_], ids: 
 @as_svg
 def sigma_map(xy_mm: Array, sigma: Array, label: str) -> Figure:
     """Sigmas (N,) at points (N, 2), filled between them."""
-    figure, axes = new_figure(*MAP_IN)
+    figure, axes = _map_figure(xy_mm)
     norm = color_norm(sigma)
     _fill(axes, xy_mm, sigma, norm, SEQUENTIAL)
     dots = axes.scatter(*xy_mm.T, c=sigma, cmap=SEQUENTIAL, norm=norm, s=26, edgecolors=INK, linewidths=0.6, zorder=3)
-    figure.colorbar(dots, ax=axes, label=label, shrink=0.9)
+    bar = figure.colorbar(dots, ax=axes, label=label)
+    if isinstance(norm, LogNorm):
+        # plain numbers instead of powers of ten
+        bar.set_ticks(ticks := _ticks(float(norm.vmin or 0), float(norm.vmax or 0)), labels=[f"{tick:g}" for tick in ticks], minor=False)
+        bar.minorticks_off()
     _dish_axes(axes, xy_mm)
     return figure
 
@@ -61,7 +65,7 @@ def sigma_map(xy_mm: Array, sigma: Array, label: str) -> Figure:
 @as_svg
 def normals_map(xy_mm: Array, lean_rad: Array, reference: str) -> Figure:
     """Arrows at points (N, 2) showing how far, and to which side, normals lean from a reference: lean_rad (N, 2)."""
-    figure, axes = new_figure(*MAP_IN)
+    figure, axes = _map_figure(xy_mm)
     lean_deg = np.degrees(lean_rad)
     length_deg = np.hypot(*lean_deg.T)
     typical = float(np.quantile(length_deg, ARROW_QUANTILE)) or float(length_deg.max()) or 1.0
@@ -69,13 +73,25 @@ def normals_map(xy_mm: Array, lean_rad: Array, reference: str) -> Figure:
     shown = np.where(long[:, None], lean_deg * (LONGEST_SHOWN * typical / np.maximum(length_deg, typical))[:, None], lean_deg)
     scale = typical / (LONGEST_ARROW * _span(xy_mm))
     axes.scatter(*xy_mm.T, s=7, c=FAINT, zorder=2)
-    style = {"angles": "xy", "scale_units": "xy", "scale": scale, "width": 0.004, "headwidth": 4, "headlength": 4.5, "zorder": 3}
+    style = {
+        "angles": "xy",
+        "scale_units": "xy",
+        "scale": scale,
+        "width": 0.004,
+        "headwidth": 4,
+        "headlength": 4.5,
+        "zorder": 3,
+        "clip_on": False,
+    }
     arrows = axes.quiver(*xy_mm.T, *shown.T, color=np.where(long, ORANGE, BLUE).tolist(), **style)
-    axes.set_title(" ", pad=14)  # room for the key
+    engine = figure.get_layout_engine()
+    assert engine is not None
+    engine.set(rect=(0.0, 0.0, 1.0, 1.0 - 0.4 / figure.get_figheight()))  # room for the key
+    top = 1.0 - 0.2 / figure.get_figheight()
     key = round_length(typical)
-    axes.quiverkey(arrows, 0.0, 1.035, key, f"{key:g}° from the {reference}", labelpos="E", coordinates="axes", color=BLUE)
+    axes.quiverkey(arrows, 0.16, top, key, f"{key:g}° from the {reference}", labelpos="E", coordinates="figure", color=BLUE)
     if long.any():
-        axes.text(1.0, 1.035, "longer", color=ORANGE, ha="right", va="center", transform=axes.transAxes)
+        figure.text(0.97, top, "longer", color=ORANGE, ha="right", va="center")
     _dish_axes(axes, xy_mm)
     return figure
 
@@ -108,6 +124,18 @@ def ratio_histogram(ratio: Array, spread: float) -> Figure:
 
 def _normal_curve(x: Array, spread: float) -> Array:
     return np.asarray(np.exp(-0.5 * (x / spread) ** 2) / (spread * np.sqrt(2 * np.pi)))
+
+
+def _map_figure(xy_mm: Array) -> tuple[Figure, Axes]:
+    """A figure of the height that the points' outline needs."""
+    along, across = np.ptp(xy_mm, axis=0) + 0.16 * _span(xy_mm)
+    return new_figure(MAP_WIDTH_IN, float(np.clip(MAP_BODY_IN * across / along, *MAP_HEIGHTS_IN)) + 0.9, "compressed")
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """1, 2, 5 times powers of ten within [low, high]; the ends where there are none."""
+    powers = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
+    return [t for p in powers for step in (1, 2, 5) if low <= (t := float(f"{step}e{p}")) <= high] or [low, high]
 
 
 def _span(xy_mm: Array) -> float:

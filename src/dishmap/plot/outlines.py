@@ -23,7 +23,16 @@ def outlines_of(result: Map, numbers: Numbers) -> list[Outline]:
     sigma = np.full(len(result.cloud), np.nan) if numbers.sigma_depth_mm is None else numbers.sigma_depth_mm
     out = []
     for n, index in enumerate(result.poses.index.tolist()):
-        out.append(Outline(ellipses[owner == index], result.cloud.center_px[n], str(result.cloud.ids[n]), _told(result, n, sigma[n]), float(sigma[n]), "good"))
+        out.append(
+            Outline(
+                ellipses[owner == index],
+                result.cloud.center_px[n],
+                str(result.cloud.ids[n]),
+                _told(result, n, sigma[n]),
+                float(sigma[n]),
+                "good",
+            )
+        )
     place = {int(ident): i for i, ident in enumerate(result.pattern.ids.tolist())}
     nominal = result.camera.project(result.camera_from_dish.apply(result.pattern.center_mm))
     visible = result.camera.contains(nominal)

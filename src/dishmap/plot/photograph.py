@@ -19,8 +19,11 @@ from dishmap.plot.canvas import BLUE, FAINT, INK, RED, Array, color_norm, hex_co
 
 BOX = (1600.0, 1200.0)
 JPEG_QUALITY = 82
-LEGEND_HEIGHT = 76.0
-PICTURE_ID = "photograph"
+# A photograph in the background needs less.
+BACKGROUND_QUALITY, BACKGROUND_PART = 70, 0.5
+LEGEND_HEIGHT = 92.0
+# What is shown about the pattern, as a part of its size.
+CROP_MARGIN = 0.12
 # Letters between these sizes; where targets stand too close for the smaller, ids show on hovering only.
 SMALLEST_TEXT, LARGEST_TEXT = 8.0, 20.0
 # Width of a digit over its height, and the part of a target's spacing that its id may take.
@@ -48,36 +51,51 @@ class Outline:
 
 @dataclass(frozen=True)
 class Frame:
-    """The picture's place in the SVG: units per pixel, width and height in units."""
+    """The part of a photograph that is shown, and its size in the SVG: units per pixel, first and past-the-last columns and rows."""
 
     scale: float
-    width: float
-    height: float
+    columns: tuple[int, int]
+    rows: tuple[int, int]
+
+    @property
+    def width(self) -> float:
+        """Width in units."""
+        return self.scale * (self.columns[1] - self.columns[0])
+
+    @property
+    def height(self) -> float:
+        """Height in units."""
+        return self.scale * (self.rows[1] - self.rows[0])
 
     def place(self, pixels: Array) -> Array:
-        """Units of pixels (..., 2); the corner of the top-left pixel is (0, 0)."""
-        return np.asarray((pixels + 0.5) * self.scale)
+        """Units of pixels (..., 2); the outer corner of the first pixel shown is (0, 0)."""
+        return np.asarray((pixels - [self.columns[0], self.rows[0]] + 0.5) * self.scale)
 
 
-def frame_of(width_px: int, height_px: int) -> Frame:
-    """The frame of a photograph of this size."""
-    scale = min(BOX[0] / width_px, BOX[1] / height_px)
-    return Frame(scale, scale * width_px, scale * height_px)
+def frame_of(width_px: int, height_px: int, around_px: Array | None = None) -> Frame:
+    """The frame of a photograph of this size: all of it, or what lies about points (K, 2)."""
+    low, high = np.zeros(2, dtype=int), np.array([width_px, height_px])
+    if around_px is not None and len(around_px):
+        margin = CROP_MARGIN * np.ptp(around_px, axis=0).max()
+        low = np.maximum(np.floor(around_px.min(axis=0) - margin).astype(int), 0)
+        high = np.minimum(np.ceil(around_px.max(axis=0) + margin).astype(int) + 1, high)
+    (left, top), (right, bottom) = low.tolist(), high.tolist()
+    return Frame(min(BOX[0] / (right - left), BOX[1] / (bottom - top)), (left, right), (top, bottom))
 
 
-def photograph_svg(image: NDArray[np.generic], outlines: list[Outline], sigma_label: str, alt: str) -> str:
-    """The photograph (H, W) with outlined targets; colours by sigma where known, with their scale below.
+def photograph_frame(image: NDArray[np.generic], outlines: list[Outline]) -> Frame:
+    """The part of a photograph (H, W) that holds the pattern's targets, with a margin."""
+    points = [o.ellipses_px.reshape(-1, 2) for o in outlines if o.state != "unused"]
+    return frame_of(image.shape[1], image.shape[0], np.concatenate(points) if points else None)
 
-    Its picture has the id `photograph`, so that other SVGs of the same page can show it again.
-    """
-    frame = frame_of(image.shape[1], image.shape[0])
+
+def photograph_svg(image: NDArray[np.generic], frame: Frame, outlines: list[Outline], sigma_label: str, alt: str) -> str:
+    """The framed part of the photograph (H, W) with outlined targets; colours by sigma where known, with their scale below."""
     sigma = np.array([o.sigma for o in outlines if o.state == "good"])
     known = sigma[np.isfinite(sigma)]
     norm = color_norm(known)
     text = _text_size(frame, outlines)
-    body = [
-        f'<image id="{PICTURE_ID}" width="{frame.width:.1f}" height="{frame.height:.1f}" preserveAspectRatio="none" href="{_jpeg(image, frame)}"/>'
-    ]
+    body = [_picture(image, frame, JPEG_QUALITY)]
     for outline in outlines:
         color = hex_colors([outline.sigma], norm)[0] if np.isfinite(outline.sigma) else BLUE
         body.append(_outline(frame, outline, color, text))
@@ -85,30 +103,30 @@ def photograph_svg(image: NDArray[np.generic], outlines: list[Outline], sigma_la
     return _svg(frame, 0.0, LEGEND_HEIGHT if known.size else 0.0, alt, [*body, legend])
 
 
-def error_svg(error: ProjectionError, width_px: int, height_px: int, alt: str, with_picture: bool) -> str:
-    """Circles whose radius is the expected projection error, over the faded photograph if the page shows it elsewhere."""
+def error_svg(error: ProjectionError, width_px: int, height_px: int, alt: str, image: NDArray[np.generic] | None = None) -> str:
+    """Circles whose radius is the expected projection error, over the faded photograph if one is given."""
     frame = frame_of(width_px, height_px)
     sigma, at = error.sigma_px.ravel(), frame.place(error.pixels.reshape(-1, 2))
     spacing = min(frame.height / error.pixels.shape[0], frame.width / error.pixels.shape[1])
     largest = float(np.nanmax(sigma))
     units_per_px = CIRCLE_PART * spacing / largest if largest > 0 else 1.0
     back = f'<rect width="{frame.width:.1f}" height="{frame.height:.1f}" fill="#ffffff" stroke="{FAINT}"/>'
-    if with_picture:
-        back += f'<use href="#{PICTURE_ID}" opacity="0.45"/>'
-    circles = [
+    if image is not None:
+        back += f'<g opacity="0.45">{_picture(image, frame, BACKGROUND_QUALITY, BACKGROUND_PART)}</g>'
+    circles = "".join(
         f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{max(s * units_per_px, 0.5):.1f}"><title>{s:.3g} px</title></circle>'
         for (x, y), s in zip(at.tolist(), sigma.tolist(), strict=True)
         if np.isfinite(s)
-    ]
-    marks = f'<g fill="none" stroke="#ffffff" stroke-width="5" opacity="0.7">{"".join(circles)}</g>' if with_picture else ""
-    marks += f'<g fill="{BLUE}" fill-opacity="0.15" stroke="{BLUE}" stroke-width="2.2">{"".join(circles)}</g>'
-    key = round_length(largest) if largest > 0 else 0.0
-    radius, middle = key * units_per_px, frame.height + CIRCLE_PART * spacing + LEGEND_HEIGHT / 2
-    legend = (
-        f'<circle cx="{radius + 6:.1f}" cy="{middle:.1f}" r="{radius:.1f}" fill="none" stroke="{BLUE}" stroke-width="2.2"/>'
-        f'<text x="{2 * radius + 18:.1f}" y="{middle + 8:.1f}" font-size="24" fill="{INK}">this radius is an expected error of {key:g} px</text>'
     )
-    return _svg(frame, CIRCLE_PART * spacing, LEGEND_HEIGHT, alt, [back, marks, legend])
+    marks = f'<g fill="none" stroke="#ffffff" stroke-width="5" opacity="0.7">{circles}</g>' if image is not None else ""
+    marks += f'<g fill="{BLUE}" fill-opacity="0.15" stroke="{BLUE}" stroke-width="2.2">{circles}</g>'
+    key, margin = round_length(largest) if largest > 0 else 0.0, CIRCLE_PART * spacing
+    radius, middle = key * units_per_px, frame.height + margin + LEGEND_HEIGHT / 2
+    legend = (
+        f'<circle cx="{radius:.1f}" cy="{middle:.1f}" r="{radius:.1f}" fill="none" stroke="{BLUE}" stroke-width="2.2"/>'
+        f'<text x="{2 * radius + 14:.1f}" y="{middle + 8:.1f}" font-size="24" fill="{INK}">this radius is an expected error of {key:g} px</text>'
+    )
+    return _svg(frame, margin, LEGEND_HEIGHT, alt, [back, marks, legend])
 
 
 def _svg(frame: Frame, around: float, below: float, alt: str, body: list[str]) -> str:
@@ -120,17 +138,18 @@ def _svg(frame: Frame, around: float, below: float, alt: str, body: list[str]) -
     )
 
 
-def _jpeg(image: NDArray[np.generic], frame: Frame) -> str:
-    """The photograph as a JPEG data URI, reduced to the frame's size, never enlarged."""
-    gray = np.asarray(image)
-    if frame.scale < 1:
-        size = (max(1, round(frame.width)), max(1, round(frame.height)))
+def _picture(image: NDArray[np.generic], frame: Frame, quality: int, part: float = 1.0) -> str:
+    """The framed part of the photograph, embedded as JPEG with up to `part` pixels a unit, never enlarged."""
+    gray = np.asarray(image)[slice(*frame.rows), slice(*frame.columns)]
+    if frame.scale * part < 1:
+        size = (max(1, round(frame.width * part)), max(1, round(frame.height * part)))
         gray = cv2.resize(gray if gray.dtype in (np.uint8, np.uint16) else gray.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     if gray.dtype != np.uint8:
         white = float(np.percentile(gray, WHITE_PERCENTILE)) or 1.0
         gray = np.clip(gray.astype(np.float32) * (255.0 / white), 0, 255).astype(np.uint8)
-    _, data = cv2.imencode(".jpg", gray, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
+    _, data = cv2.imencode(".jpg", gray, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    link = "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
+    return f'<image width="{frame.width:.1f}" height="{frame.height:.1f}" preserveAspectRatio="none" href="{link}"/>'
 
 
 def _text_size(frame: Frame, outlines: list[Outline]) -> float:
@@ -176,7 +195,7 @@ def _outline(frame: Frame, outline: Outline, color: str, text: float) -> str:
 
 def _legend(frame: Frame, norm: Normalize, label: str) -> str:
     """A strip of colours with its values under it and what they are beside it."""
-    left, width, top, steps = 60.0, 520.0, frame.height + 12, 52
+    left, width, top, steps = 60.0, min(520.0, 0.4 * frame.width), frame.height + 16, 52
     colors = hex_colors(norm.inverse((np.arange(steps) + 0.5) / steps), norm)
     parts = [
         f'<rect x="{i * width / steps + left:.1f}" y="{top:.1f}" width="{width / steps + 0.5:.1f}" height="20" fill="{color}" shape-rendering="crispEdges"/>'
@@ -185,5 +204,5 @@ def _legend(frame: Frame, norm: Normalize, label: str) -> str:
     for part in (0.0, 0.5, 1.0):
         x, value = left + part * width, float(norm.inverse(part))
         parts.append(f'<text x="{x:.1f}" y="{top + 48:.1f}" font-size="24" text-anchor="middle" fill="{INK}">{value:.3g}</text>')
-    parts.append(f'<text x="{left + width + 40:.1f}" y="{top + 18:.1f}" font-size="24" fill="{INK}">{escape(label)}</text>')
+    parts.append(f'<text x="{left + width + 40:.1f}" y="{top + 19:.1f}" font-size="24" fill="{INK}">{escape(label)}</text>')
     return "".join(parts)

@@ -188,15 +188,17 @@ def _ellipses(image: Image, threshold: Image, contours: list[NDArray[np.int32]],
         return _nothing()
     points, starts = _concatenated([c for c, k in zip(contours, keep, strict=True) if k])
     counts = np.diff(np.append(starts, len(points)))
-    moved, shift, good, contrast = _to_crossing(image, threshold, points)
+    # OpenCV runs around ink one way and around holes in it the other way
+    dark = _signed_area(points, starts, counts) > 0
+    mean = np.stack([np.add.reduceat(points[:, k], starts) for k in (0, 1)], axis=1) / counts[:, None]
+    outward = (points - np.repeat(mean, counts, axis=0)) * np.repeat(np.where(dark, 1.0, -1.0), counts)[:, None]
+    moved, good, contrast = _to_crossing(image, threshold, points, outward)
     weights = good.astype(float)
     enough = np.add.reduceat(weights, starts) >= np.maximum(LEAST_GOOD_POINTS * counts, FEWEST_POINTS - 2)
     fits = fit_ellipses(moved, starts, weights)
-    outward = (shift * (points - np.repeat(fits.center, counts, axis=0))).sum(axis=1) * weights
-    dark = np.add.reduceat(outward, starts) > 0
     contrast_mean = np.add.reduceat(contrast * weights, starts) / np.maximum(np.add.reduceat(weights, starts), 1.0)
     with np.errstate(invalid="ignore"):
-        keep = enough & _is_ellipse(fits, _area(moved, starts, counts))
+        keep = enough & _is_ellipse(fits, np.abs(_signed_area(moved, starts, counts)))
     found = _Found(
         fits.center * reduction + (reduction - 1) / 2,
         fits.semi_axes * reduction,
@@ -224,38 +226,39 @@ def _is_ellipse(fits: Fits, area: Array) -> NDArray[np.bool_]:
     )
 
 
-def _area(points: Array, starts: NDArray[np.int64], counts: NDArray[np.int64]) -> Array:
-    """Area (M,) of each closed contour."""
+def _signed_area(points: Array, starts: NDArray[np.int64], counts: NDArray[np.int64]) -> Array:
+    """Area (M,) of each closed contour, negative when it runs from +u towards +v."""
     following = np.arange(1, len(points) + 1)
     following[starts + counts - 1] = starts
     x, y = points.T
-    return np.abs(np.add.reduceat(x * y[following] - x[following] * y, starts)) / 2
+    return np.asarray(np.add.reduceat(x[following] * y - x * y[following], starts) / 2)
 
 
-def _to_crossing(image: Image, threshold: Image, points: Array) -> tuple[Array, Array, NDArray[np.bool_], Array]:
+def _to_crossing(image: Image, threshold: Image, points: Array, outward: Array) -> tuple[Array, NDArray[np.bool_], Array]:
     """Move contour pixels (N, 2), the last ink before the ground, to where the grey level crosses the threshold.
 
-    The crossing is taken between the pixel and its neighbour along the row or column, whichever is steeper, by linear
-    interpolation: so the contour lies neither on the inner nor on the outer side. Returns the points, the unit steps
-    towards the ground, where there is a crossing, and the contrast there.
+    outward (N, 2): direction from the ink to the ground, roughly. The crossing is taken between the pixel and that one of
+    its four neighbours which is lighter and lies best in this direction, by linear interpolation: so the contour lies
+    neither on the inner nor on the outer side. Returns the points, where there is a crossing, and the contrast there.
     """
     h, w = image.shape
     x, y = points.T.astype(np.intp)
-    inside = (x > 0) & (y > 0) & (x < w - 1) & (y < h - 1)
-    xs, ys = np.clip(x, 1, max(1, w - 2)), np.clip(y, 1, max(1, h - 2))
-    flat, at = image.ravel(), ys * w + xs
-    here, level = flat[at].astype(float), threshold.ravel()[at].astype(float)
-    right, left, down, up = (flat[np.clip(at + k, 0, flat.size - 1)].astype(float) for k in (1, -1, w, -w))
-    along_x, along_y = np.maximum(right, left), np.maximum(down, up)
-    row = np.abs(right - left) >= np.abs(down - up)
-    best = np.where(row, along_x, along_y)
-    row = np.where(best > level, row, ~row)
-    best = np.where(row, along_x, along_y)
-    good = inside & (best > level)
-    part = np.where(good, (level - here) / np.where(good, best - here, 1.0), 0.0)
-    sign_x, sign_y = np.where(right >= left, 1.0, -1.0), np.where(down >= up, 1.0, -1.0)
-    step = np.stack([np.where(row, sign_x, 0.0), np.where(row, 0.0, sign_y)], axis=1)
-    return points + step * np.clip(part, 0.0, 1.0)[:, None], step, good, 2 * (level - _darkest(flat, at, w, here))
+    good = (x > 0) & (y > 0) & (x < w - 1) & (y < h - 1)
+    flat, at = image.ravel(), np.where(good, y * w + x, 0)
+    here, level = flat[at].astype(np.float32), threshold.ravel()[at].astype(np.float32)
+    towards = (outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)).astype(np.float32)
+    best, best_value = np.zeros_like(here), here
+    step = np.zeros_like(towards)
+    for k, direction in ((1, (1, 0)), (-1, (-1, 0)), (w, (0, 1)), (-w, (0, -1))):
+        value = flat[np.where(good, at + k, 0)].astype(np.float32)
+        score = (value - here) * np.maximum(towards[:, 0] * direction[0] + towards[:, 1] * direction[1], 0)
+        better = score > best
+        best, best_value = np.where(better, score, best), np.where(better, value, best_value)
+        step[better] = direction
+    good &= best_value > level
+    part = np.where(good, (level - here) / np.where(good, best_value - here, 1), 0)
+    contrast = 2 * (level - _darkest(flat, at, w, here))
+    return points + step * np.clip(part, 0, 1)[:, None], good, contrast
 
 
 def _darkest(flat: Image, at: NDArray[np.intp], width: int, here: Array) -> Array:

@@ -40,6 +40,8 @@ FINE_FACTOR, FINE_BLUR_PX = 3, 0.4
 # Pixels handled at once, so that the working arrays stay in the processor's cache.
 PIXELS_AT_ONCE = 24000
 TINY = np.float32(1e-6)
+# Share of the cut up to which a residual keeps its full weight.
+TAPER = np.float32(0.65)
 # Ink over ground, as far as a tone curve is followed.
 TONE_RATIOS = (0.02, 0.95)
 
@@ -331,34 +333,47 @@ def ring_sums(pixels: RingPixels, rings: Rings, maps: LocalMaps, state: State, w
 def _sums(rows: slice, pixels: RingPixels, rings: Rings, maps: LocalMaps, state: State, weighting: Weighting) -> tuple[RingSums, Single]:
     cover, geometry, edges = coverage_columns(rows, pixels, rings, maps, state)
     used, grey = pixels.used[rows].astype(np.float32), pixels.grey[rows]
-    columns = light_columns(pixels.s[rows], pixels.t[rows], cover)
-    light, model = _levels(columns, grey, used)
-    ratio = np.clip(light[:, 3:4] / np.maximum(light[:, :1], 1e-6), *TONE_RATIOS).astype(np.float32)
-    bent, slope, geometry[:, TONE] = toned(np.clip(cover, 0, 1), ratio, state.log_gamma[pixels.target[rows], None].astype(np.float32))
-    geometry[:, :TONE] *= slope[:, None]
-    columns = light_columns(pixels.s[rows], pixels.t[rows], bent)
+    s, t = pixels.s[rows], pixels.t[rows]
+    log_gamma = np.asarray(state.log_gamma[pixels.target[rows], None], np.float32)
+    bent, slope, geometry[:, TONE] = toned(np.clip(cover, 0, 1), _dark_over_light(cover, grey, used), log_gamma)
+    columns = light_columns(s, t, bent)
     light, model = _levels(columns, grey, used)
     robust = used
     if weighting.cut is not None:
         cut = weighting.cut[rows, None].astype(np.float32)
-        robust = _bisquare(grey - model, cut, used)
-        # the levels were found with the outliers in; once more without them
-        light, model = _levels(columns, grey, robust)
-        robust = _bisquare(grey - model, cut, used)
+        robust = _tapered(grey - model, cut, used)
+        if not np.array_equal(robust, used):
+            # the levels were found with the outliers in; once more without them
+            light, model = _levels(columns, grey, robust)
+            robust = _tapered(grey - model, cut, used)
     residual = grey - model
     variance = np.maximum(np.float32(weighting.base) + np.float32(weighting.slope) * np.maximum(model, 0), TINY)
     weight = robust / variance
-    step = (light[:, None, 3:] - light[:, None, :3]).astype(np.float32)
-    geometry *= step @ (columns[:, :3] + columns[:, 3:])
-    every = np.concatenate([geometry, columns], axis=1)
-    weighted = every * weight[:, None]
-    normal = (weighted @ np.swapaxes(every, 1, 2)).astype(float)
-    right = (weighted @ residual[..., None])[..., 0].astype(float)
-    kept = (edges @ robust[..., None])[..., 0] / np.maximum((edges @ used[..., None])[..., 0], TINY)
+    root = np.sqrt(weight)
+    step = (light[:, 3:] - light[:, :3]).astype(np.float32)
+    contrast = (step[:, :1] + step[:, 1:2] * s + step[:, 2:] * t) * root
+    every = np.empty((len(s), GEOMETRY + LIGHT, s.shape[1]), np.float32)
+    np.multiply(geometry[:, :TONE], (contrast * slope)[:, None], out=every[:, :TONE])
+    np.multiply(geometry[:, TONE], contrast, out=every[:, TONE])
+    np.multiply(columns, root[:, None], out=every[:, GEOMETRY:])
+    normal = (every @ np.swapaxes(every, 1, 2)).astype(float)
+    right = (every @ (residual * root)[..., None])[..., 0].astype(float)
+    whole = (edges @ used[..., None])[..., 0]
+    # unused circles, and rings without pixels, count as whole
+    kept = np.where(whole > TINY, (edges @ robust[..., None])[..., 0] / np.maximum(whole, TINY), 1.0)
     square = np.einsum("mn,mn,mn->m", weight, residual, residual).astype(float)
-    # circles of unused places and rings without pixels count as whole
-    kept[(edges @ used[..., None])[..., 0] <= TINY] = 1.0
     return RingSums(normal, right, light, square, robust.sum(axis=1, dtype=float), kept.astype(float)), residual
+
+
+def _dark_over_light(cover: Single, grey: Single, used: Single) -> Single:
+    """Ink level over ground level (M, 1) of each ring, from a fit of the two levels alone; it only bends the tone curve."""
+    ink = cover * used
+    a, b, c = used.sum(axis=1), ink.sum(axis=1), np.einsum("mn,mn->m", ink, cover)
+    p, q = np.einsum("mn,mn->m", grey, used), np.einsum("mn,mn->m", grey, ink)
+    determinant = np.maximum(a * c - b * b, TINY)
+    ground, step = (c * p - b * q) / determinant, (a * q - b * p) / determinant
+    ratio = (ground + step) / np.maximum(ground, TINY)
+    return np.clip(ratio, *TONE_RATIOS)[:, None].astype(np.float32)
 
 
 def _levels(columns: Single, grey: Single, weight: Single) -> tuple[Array, Single]:
@@ -366,10 +381,12 @@ def _levels(columns: Single, grey: Single, weight: Single) -> tuple[Array, Singl
     return light, (light[:, None].astype(np.float32) @ columns)[:, 0]
 
 
-def _bisquare(residual: Single, cut: Single, used: Single) -> Single:
-    """Weights that are 1 up to half the cut and fall to 0 at the cut, so that Gaussian noise loses nothing."""
+def _tapered(residual: Single, cut: Single, used: Single) -> Single:
+    """Weights that are 1 up to TAPER of the cut and fall to 0 at the cut, so that Gaussian noise loses nothing."""
     x = residual / cut
-    return np.square(np.clip((1 - x * x) * np.float32(4 / 3), 0, 1)) * used
+    if not (np.abs(x) * used > TAPER).any():
+        return used
+    return np.square(np.clip((1 - x * x) * np.float32(1 / (1 - TAPER**2)), 0, 1)) * used
 
 
 def without_light(sums: RingSums) -> tuple[Array, Array]:
