@@ -57,11 +57,15 @@ POLICY = "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; sc
 def page(title: str, body: Iterable[str], scripts: Iterable[str] = ()) -> str:
     """A whole page from sections of HTML; scripts (JavaScript) stand at its end."""
     code = "".join(f"<script>{script}</script>\n" for script in scripts)
-    return (
-        f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n'
-        f"<body>\n<main>\n<h1>{escape(title)}</h1>\n{chr(10).join(body)}\n</main>\n{code}</body>\n</html>\n"
+    head = (
+        '<meta charset="utf-8">',
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f"<title>{escape(title)}</title>",
+        f"<style>{STYLE}</style>",
     )
+    main = "\n".join([f"<h1>{escape(title)}</h1>", *(part for part in body if part)])
+    return f'<!DOCTYPE html>\n<html lang="en">\n<head>\n{chr(10).join(head)}\n</head>\n<body>\n<main>\n{main}\n</main>\n{code}</body>\n</html>\n'
 
 
 def section(heading: str, *parts: str) -> str:
@@ -112,7 +116,7 @@ def charts(*figures: str) -> str:
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]], text_columns: Iterable[int] = ()) -> str:
     """A table of ready texts; numbers to the right, the columns of `text_columns` to the left."""
-    kind = {column: ' class="text"' for column in text_columns}
+    kind = dict.fromkeys(text_columns, ' class="text"')
     head = "".join(f'<th scope="col"{kind.get(i, "")}>{escape(h)}</th>' for i, h in enumerate(heads))
     lines = ("<tr>" + "".join(f"<td{kind.get(i, '')}>{escape(cell)}</td>" for i, cell in enumerate(row)) + "</tr>" for row in rows)
     return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>\n{chr(10).join(lines)}\n</tbody></table></div>'

@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import dishmap
+from dishmap.camera.calibrate import Calibration
 from dishmap.camera.model import Camera
 from dishmap.camera.uncertainty import projection_error
 from dishmap.page import bullet_list, charts, fact_grid, figure, page, paragraph, script_json, section, table, verdict_box
 from dishmap.pipeline import Map
+from dishmap.plot.calibration import coverage_map, view_bars
 from dishmap.plot.canvas import round_length
 from dishmap.plot.maps import normals_map, ratio_histogram, residual_map, sigma_map
 from dishmap.plot.outlines import check_picture, outlines_of, unused_outlines
@@ -33,8 +35,9 @@ RINGS, SPOKES = 24, 73
 # Residuals are drawn so that the largest takes about this part of the surface's width.
 EXAGGERATED_PART = 0.08
 # Where the eye stands, in units of the scene's size: a little above the rim.
-EYE = {"x": 0.6, "y": -1.15, "z": 0.8}
+EYE = {"x": 0.55, "y": -1.05, "z": 0.72}
 SCENE_MARGIN = 0.04
+FEW_TICKS = 4
 PLOTLY_DIVERGING = [[0.0, "#053061"], [0.25, "#6aacd0"], [0.5, "#f7f7f7"], [0.75, "#e58368"], [1.0, "#67001f"]]
 # Rows and columns of the circles of the paper's Fig. 1.
 FIGURE_1_GRID = (9, 12)
@@ -61,6 +64,51 @@ def map_report(result: Map, image: NDArray[np.generic], title: str, inputs: dict
         _inputs(inputs),
     ]
     return page(title, body, _scripts(result, numbers))
+
+
+def calibration_report(calibration: Calibration, title: str) -> str:
+    """The report of a camera's calibration as one HTML page: residuals of each view, coverage, parameters, expected projection error."""
+    camera, views = calibration.camera, calibration.views
+    pixels = np.concatenate([view.pixels for view in views])
+    residuals, used = np.concatenate(calibration.residuals_px), np.concatenate(calibration.used)
+    headline = f"{len(views)} views fit to {number(calibration.rms_px)} px rms; corners cover {calibration.coverage:.0%} of the picture."
+    notes = [*calibration.notes, *(f"{name} was left out: {reason}." for name, reason in calibration.rejected.items())]
+    facts = [
+        ("Views used", f"{len(views)} of {len(views) + len(calibration.rejected)}", f"{int(used.sum())} of {len(used)} corners"),
+        ("Rms residual", f"{number(calibration.rms_px)} px", "of both coordinates together"),
+        ("Noise of a coordinate", f"{number(calibration.sigma_px)} px", f"sigmas enlarged {number(calibration.inflation)} times"),
+        ("Coverage", f"{calibration.coverage:.0%}", "of the picture held corners"),
+    ]
+    bars = figure(
+        view_bars(calibration.view_names, calibration.view_rms_px, calibration.rms_px),
+        "Root mean square residual of each view. One that stands out was moved, blurred or wrongly found.",
+        "Bars of the residual of each view.",
+    )
+    where = figure(
+        coverage_map(pixels, residuals, used, camera.width_px, camera.height_px),
+        "All corners, coloured by the length of their residual. Where there are none, the lens is extrapolated.",
+        "Map of where corners were seen.",
+    )
+    body = [
+        verdict_box(headline, bool(notes)),
+        fact_grid(facts),
+        section("What to know", bullet_list(notes)) if notes else "",
+        section("Views", charts(bars, where)),
+        section("Parameters", _parameters(camera)),
+        _calibration_error(camera, None),
+        _inputs({}),
+    ]
+    return page(title, body)
+
+
+def _parameters(camera: Camera) -> str:
+    sigmas = np.full(len(camera.parameters), np.nan) if camera.covariance is None else np.sqrt(np.diag(camera.covariance))
+    rows = [
+        (name, f"{value:.6g}", number(float(sigma)), "px" if i < 4 else "1")
+        for i, (name, value, sigma) in enumerate(zip(camera.parameter_names, camera.parameters, sigmas, strict=True))
+    ]
+    size = f"{camera.width_px}x{camera.height_px} px, lens model {camera.model}"
+    return paragraph(size) + table(("parameter", "value", "sigma", "unit"), rows, (0, 3))
 
 
 def _verdict(verdict: Verdict) -> list[str]:
@@ -167,8 +215,9 @@ def _calibration_error(camera: Camera, image: NDArray[np.generic] | None) -> str
     summary = f"{number(error.rms_px)} px rms over the picture"
     svg = error_svg(error, camera.width_px, camera.height_px, f"Map of the expected projection error, {summary}.", image)
     caption = (
-        f"Radius of each circle: the error to be expected where a known direction is projected, from the calibration's covariance; {summary}. "
-        f"A small turn of the camera explains most of it as a rule: without the turn that fits best, {number(shape.rms_px)} px rms are left."
+        "Radius of each circle: the error to be expected where a known direction is projected, from the calibration's covariance; "
+        f"{summary}. As a rule a small turn of the camera explains most of it: without the turn that fits best, {number(shape.rms_px)} px "
+        "rms are left."
     )
     return section(heading, figure(svg, caption))
 
@@ -216,7 +265,7 @@ def _exaggeration(fit: SurfaceFit, xy_mm: Array) -> float:
 
 
 def _scripts(result: Map, numbers: Numbers) -> list[str]:
-    """plotly and the call that draws the 3D picture; nothing without a surface."""
+    """The library plotly.js and the call that draws the 3D picture; nothing without a surface."""
     if result.surface is None:
         return []
     from plotly.offline import get_plotlyjs
@@ -264,8 +313,10 @@ def _axes_of_scene(xy_mm: Array, z_mm: Array) -> dict[str, Any]:
         f"{name}axis": {"title": {"text": f"{name} (mm)"}, "range": [round(float(a), 3), round(float(b), 3)]}
         for name, a, b in zip("xyz", low, high, strict=True)
     }
+    # a short axis has no room for many numbers
+    axes["zaxis"]["nticks"] = FEW_TICKS
     ratio = {name: round(float(length), 4) for name, length in zip("xyz", (high - low) / (high - low).max(), strict=True)}
-    return {**axes, "aspectmode": "manual", "aspectratio": ratio, "camera": {"eye": EYE, "center": {"x": 0, "y": 0, "z": -0.1}}}
+    return {**axes, "aspectmode": "manual", "aspectratio": ratio, "camera": {"eye": EYE, "center": {"x": 0, "y": 0, "z": -0.05}}}
 
 
 def _mesh(fit: SurfaceFit) -> dict[str, Any]:
@@ -309,17 +360,18 @@ def _stems(result: Map, numbers: Numbers, fit: SurfaceFit, foot: Array, top: Arr
         "line": {"color": "#1a1a1a", "width": 1},
         "colorbar": {"title": {"text": "residual (mm)"}, "thickness": 16, "len": 0.7},
     }
-    return [
-        {
-            **{"type": "scatter3d", "mode": "lines", "visible": visible, "hoverinfo": "skip"},
-            **{"x": line[0], "y": line[1], "z": line[2], "line": {"color": "#555555", "width": 3}},
-        },
-        {
-            **{"type": "scatter3d", "mode": "markers", "visible": visible, "marker": dots},
-            **{"x": _listed(x, 4), "y": _listed(y, 4), "z": _listed(top, 4)},
-            **{"text": _hover_texts(result, numbers, fit), "hovertemplate": "%{text}<extra></extra>"},
-        },
-    ]
+    shared = {"type": "scatter3d", "visible": visible}
+    lines = {"mode": "lines", "hoverinfo": "skip", "x": line[0], "y": line[1], "z": line[2], "line": {"color": "#555555", "width": 3}}
+    points = {
+        "mode": "markers",
+        "marker": dots,
+        "x": _listed(x, 4),
+        "y": _listed(y, 4),
+        "z": _listed(top, 4),
+        "text": _hover_texts(result, numbers, fit),
+        "hovertemplate": "%{text}<extra></extra>",
+    }
+    return [shared | lines, shared | points]
 
 
 def _hover_texts(result: Map, numbers: Numbers, fit: SurfaceFit) -> list[str]:

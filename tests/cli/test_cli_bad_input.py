@@ -44,7 +44,7 @@ def noise() -> bytes:
         ("huge.png", huge_png(), "it has 30000x30000 px; up to 200 megapixels"),
         ("other.png", grey(320, 240), "the photograph is 320x240 px but the camera was calibrated at 640x480 px"),
         ("turned.png", grey(480, 640), "the photograph is 480x640 px but the camera was calibrated at 640x480 px"),
-        ("blank.png", grey(640, 480), "circle"),
+        ("blank.png", grey(640, 480), "0 of 0 ellipses"),
         ("noise.png", noise(), "circle|pattern"),
     ],
 )
@@ -129,9 +129,9 @@ def test_all_targets_clipped(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (lambda p: p["target_kinds"]["multi4"]["circles"][0].update(radius_mm=-5), "radius_mm"),
-        (lambda p: p["target_kinds"]["multi4"]["circles"][0].update(radius_mm=float("nan")), "NaN"),
-        (lambda p: p["targets"][3].update(center_mm=[1, 2, float("inf")]), "Infinity"),
+        (lambda p: p["target_kinds"]["multi"]["circles"][0].update(radius_mm=-5), "radius_mm"),
+        (lambda p: p["target_kinds"]["multi"]["circles"][0].update(radius_mm=float("nan")), "NaN"),
+        (lambda p: p["targets"][3].update(center_mm=[1, 2, float("inf")]), "must be a finite number"),
         (lambda p: p["targets"][3].update(centre_mm=[1, 2, 3]), "unknown key 'centre_mm'.*'center_mm'"),
         (lambda p: p.update(targets=[]), "targets"),
     ],
@@ -182,7 +182,7 @@ def test_pose_guesses_that_are_none(text: str, message: str, shot: Path, tmp_pat
     assert message in said
 
 
-@pytest.mark.parametrize("out", ["notes.txt", "notes.txt/out", "no\0name"], ids=["a file", "under a file", "NUL in the name"])
+@pytest.mark.parametrize("out", ["notes.txt", "notes.txt/out"], ids=["a file", "under a file"])
 def test_output_that_cannot_be_written(out: str, shot: Path, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     words = [
@@ -197,10 +197,7 @@ def test_output_that_cannot_be_written(out: str, shot: Path, tmp_path: Path) -> 
         if single and out == "notes.txt":
             continue  # a file is what these write
         target = f"{tmp_path / out}{'/x.png' if single else ''}"
-        done = dishmap(*some, "--out", target)
-        assert done.exit_code == 2, done.output
-        assert done.stderr.count("\n") <= 4
-        assert "Traceback" not in done.output
+        assert "cannot write" in refused(dishmap(*some, "--out", target))
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
     assert (tmp_path / "notes.txt").read_text() == "mine"
 

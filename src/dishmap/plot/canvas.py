@@ -10,7 +10,7 @@ import functools
 import io
 import re
 from collections.abc import Callable
-from typing import Literal, ParamSpec
+from typing import Any, Literal, ParamSpec
 
 import matplotlib
 import numpy as np
@@ -24,7 +24,7 @@ P = ParamSpec("P")
 
 BLUE, ORANGE, RED, INK, FAINT = "#0072b2", "#d55e00", "#b2182b", "#1a1a1a", "#8a8a8a"
 SEQUENTIAL, DIVERGING = "viridis", "RdBu_r"
-STYLE = {
+STYLE: dict[Any, Any] = {
     "svg.hashsalt": "dishmap",
     "svg.fonttype": "path",
     "font.size": 11.0,

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
@@ -35,9 +38,13 @@ def residual_map(xy_mm: Array, residual_mm: Array, off: NDArray[np.bool_], ids: 
     largest = largest or float(np.abs(residual_mm).max()) or 1.0
     norm = Normalize(-largest, largest)
     _fill(axes, xy_mm[on], residual_mm[on], norm, DIVERGING)
-    dots = axes.scatter(*xy_mm[on].T, c=residual_mm[on], cmap=DIVERGING, norm=norm, s=26, edgecolors=INK, linewidths=0.6, zorder=3)
+    dots = axes.scatter(
+        xy_mm[on, 0], xy_mm[on, 1], c=residual_mm[on], cmap=DIVERGING, norm=norm, s=26, edgecolors=INK, linewidths=0.6, zorder=3
+    )
     if off.any():
-        axes.scatter(*xy_mm[off].T, marker="X", s=60, c=ORANGE, edgecolors=INK, linewidths=0.6, zorder=4, label="off the surface")
+        axes.scatter(
+            xy_mm[off, 0], xy_mm[off, 1], marker="X", s=60, c=ORANGE, edgecolors=INK, linewidths=0.6, zorder=4, label="off the surface"
+        )
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderpad=0.0)
         if off.sum() <= MOST_NAMES:
             _name(axes, xy_mm[off], ids[off])
@@ -52,7 +59,7 @@ def sigma_map(xy_mm: Array, sigma: Array, label: str) -> Figure:
     figure, axes = _map_figure(xy_mm)
     norm = color_norm(sigma)
     _fill(axes, xy_mm, sigma, norm, SEQUENTIAL)
-    dots = axes.scatter(*xy_mm.T, c=sigma, cmap=SEQUENTIAL, norm=norm, s=26, edgecolors=INK, linewidths=0.6, zorder=3)
+    dots = axes.scatter(xy_mm[:, 0], xy_mm[:, 1], c=sigma, cmap=SEQUENTIAL, norm=norm, s=26, edgecolors=INK, linewidths=0.6, zorder=3)
     bar = figure.colorbar(dots, ax=axes, label=label)
     if isinstance(norm, LogNorm):
         # plain numbers instead of powers of ten
@@ -72,8 +79,8 @@ def normals_map(xy_mm: Array, lean_rad: Array, reference: str) -> Figure:
     long = length_deg > LONGEST_SHOWN * typical
     shown = np.where(long[:, None], lean_deg * (LONGEST_SHOWN * typical / np.maximum(length_deg, typical))[:, None], lean_deg)
     scale = typical / (LONGEST_ARROW * _span(xy_mm))
-    axes.scatter(*xy_mm.T, s=7, c=FAINT, zorder=2)
-    style = {
+    axes.scatter(xy_mm[:, 0], xy_mm[:, 1], s=7, c=FAINT, zorder=2)
+    style: dict[str, Any] = {
         "angles": "xy",
         "scale_units": "xy",
         "scale": scale,
@@ -84,8 +91,9 @@ def normals_map(xy_mm: Array, lean_rad: Array, reference: str) -> Figure:
         "clip_on": False,
     }
     arrows = axes.quiver(*xy_mm.T, *shown.T, color=np.where(long, ORANGE, BLUE).tolist(), **style)
+    arrows.set_in_layout(False)
     engine = figure.get_layout_engine()
-    assert engine is not None
+    assert isinstance(engine, ConstrainedLayoutEngine)
     engine.set(rect=(0.0, 0.0, 1.0, 1.0 - 0.4 / figure.get_figheight()))  # room for the key
     top = 1.0 - 0.2 / figure.get_figheight()
     key = round_length(typical)

@@ -18,7 +18,7 @@ from dishmap.camera.uncertainty import ProjectionError
 from dishmap.plot.canvas import BLUE, FAINT, INK, RED, Array, color_norm, hex_colors, round_length
 
 BOX = (1600.0, 1200.0)
-JPEG_QUALITY = 82
+JPEG_QUALITY = 76
 # A photograph in the background needs less.
 BACKGROUND_QUALITY, BACKGROUND_PART = 70, 0.5
 LEGEND_HEIGHT = 92.0
@@ -122,9 +122,10 @@ def error_svg(error: ProjectionError, width_px: int, height_px: int, alt: str, i
     marks += f'<g fill="{BLUE}" fill-opacity="0.15" stroke="{BLUE}" stroke-width="2.2">{circles}</g>'
     key, margin = round_length(largest) if largest > 0 else 0.0, CIRCLE_PART * spacing
     radius, middle = key * units_per_px, frame.height + margin + LEGEND_HEIGHT / 2
+    meaning = f"this radius is an expected error of {key:g} px"
     legend = (
         f'<circle cx="{radius:.1f}" cy="{middle:.1f}" r="{radius:.1f}" fill="none" stroke="{BLUE}" stroke-width="2.2"/>'
-        f'<text x="{2 * radius + 14:.1f}" y="{middle + 8:.1f}" font-size="24" fill="{INK}">this radius is an expected error of {key:g} px</text>'
+        f'<text x="{2 * radius + 14:.1f}" y="{middle + 8:.1f}" font-size="24" fill="{INK}">{meaning}</text>'
     )
     return _svg(frame, margin, LEGEND_HEIGHT, alt, [back, marks, legend])
 
@@ -179,7 +180,8 @@ def _outline(frame: Frame, outline: Outline, color: str, text: float) -> str:
         rings.append(f'<circle r="1" transform="{matrix}" vector-effect="non-scaling-stroke"/>')
     circles = "".join(rings)
     # a dark line under the coloured one keeps it visible on ink and on ground
-    lines = f'<g fill="none" stroke="#000000" stroke-width="3.6">{circles}</g><g fill="none" stroke="{color}" stroke-width="2.2"{dash}>{circles}</g>'
+    lines = f'<g fill="none" stroke="#000000" stroke-width="3.6">{circles}</g>'
+    lines += f'<g fill="none" stroke="{color}" stroke-width="2.2"{dash}>{circles}</g>'
     (x, y), name = frame.place(outline.label_px).tolist(), ""
     if outline.state == "rejected":
         lines += f'<path d="M{x - 9:.1f} {y - 9:.1f}l18 18m0 -18l-18 18" stroke="#e31a1c" stroke-width="3.5"/>'
@@ -197,10 +199,8 @@ def _legend(frame: Frame, norm: Normalize, label: str) -> str:
     """A strip of colours with its values under it and what they are beside it."""
     left, width, top, steps = 60.0, min(520.0, 0.4 * frame.width), frame.height + 16, 52
     colors = hex_colors(norm.inverse((np.arange(steps) + 0.5) / steps), norm)
-    parts = [
-        f'<rect x="{i * width / steps + left:.1f}" y="{top:.1f}" width="{width / steps + 0.5:.1f}" height="20" fill="{color}" shape-rendering="crispEdges"/>'
-        for i, color in enumerate(colors)
-    ]
+    size = f'y="{top:.1f}" width="{width / steps + 0.5:.1f}" height="20" shape-rendering="crispEdges"'
+    parts = [f'<rect x="{i * width / steps + left:.1f}" {size} fill="{color}"/>' for i, color in enumerate(colors)]
     for part in (0.0, 0.5, 1.0):
         x, value = left + part * width, float(norm.inverse(part))
         parts.append(f'<text x="{x:.1f}" y="{top + 48:.1f}" font-size="24" text-anchor="middle" fill="{INK}">{value:.3g}</text>')

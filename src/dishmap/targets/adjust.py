@@ -220,6 +220,18 @@ def inverse_scaled(matrix: Array) -> Array:
     return out
 
 
+def with_other_priors(fit: Adjusted, before: Priors, after: Priors) -> tuple[Poses, State]:
+    """Where a converged fit would have gone with other priors, from its normal equations alone."""
+    _, old = prior_terms(fit.poses, fit.state, before)
+    precision, new = prior_terms(fit.poses, fit.state, after)
+    information = fit.data_information.copy()
+    information[:, range(GEOMETRY), range(GEOMETRY)] += precision
+    delta = solve_scaled(information, new - old)
+    # targets that did not converge, or would go far, stay where they are
+    delta *= (np.abs(delta[:, 3:6]).max(axis=1) < LARGEST_TURN_RAD)[:, None] & fit.converged[:, None]
+    return _moved(fit.poses, fit.state, delta)
+
+
 def _largest_motion_px(delta: Array, maps: LocalMaps, target: NDArray[np.int64], count: int) -> Array:
     """Rough bound on how far a step moves any printed point, px, plus how much it changes blur and offset."""
     fields = np.einsum("mkgl,mg->mkl", maps.motion[..., :3], delta[target, :6])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.camera.model import Camera
-from dishmap.targets.adjust import Adjusted, Batch, Priors, adjust, by_target, inverse_scaled
+from dishmap.targets.adjust import Adjusted, Batch, Priors, adjust, by_target, inverse_scaled, with_other_priors
 from dishmap.targets.detect import Detections
 from dishmap.targets.edges import Poses
 from dishmap.targets.identify import Identity
@@ -35,7 +35,7 @@ COARSE_PIXELS = 1200
 FIRST_STEPS, COARSE_STEPS, FULL_STEPS = 3, 8, 8
 COARSE_ENOUGH = 0.9
 # Targets in one group: bounds memory, and keeps the windows of a group about equally large.
-GROUP_SIZE = 64
+GROUP_SIZE = 96
 # Residuals beyond this many sigma and this share of the contrast are not noise but glare, dirt or something in front.
 CUT_SIGMAS, CUT_CONTRAST = 8.0, 0.1
 # A ring of which less than this share of an edge survives is left out, when the target has others.
@@ -108,8 +108,7 @@ def start_groups(
             continue
         poses = nominal_poses(pattern, index, identity.camera_from_dish)
         order = np.argsort(np.linalg.norm(poses.position_mm, axis=1), kind="stable")
-        for begin in range(0, len(order), GROUP_SIZE):
-            part = order[begin : begin + GROUP_SIZE]
+        for part in np.array_split(order, -(-len(order) // GROUP_SIZE)):
             group = _first_group(camera, pattern, kind, index[part], poses.take(part), assumptions)
             group = _on_ellipses(group, pattern, detections, identity)
             inside = np.asarray(camera.contains(group.outlines(), margin_px=1.0).all(axis=(1, 2)))
@@ -291,7 +290,8 @@ def full_fit(image: NDArray[Any], pattern: Pattern, coarse: Coarse, shared: Shar
     blur = float(np.median(group.state.blur_px))
     priors = replace(group.batch.priors, normal=expected, normal_sigma_rad=np.full(len(expected), shared.normal_sigma_rad), blur_px=blur)
     priors = replace(priors, log_gamma=shared.log_gamma, log_gamma_sigma=shared.log_gamma_sigma)
-    group = replace(group, batch=replace(group.batch, priors=priors))
+    poses, state = with_other_priors(coarse.adjusted, group.batch.priors, priors)
+    group = replace(group, poses=poses, state=state, batch=replace(group.batch, priors=priors))
     widest = float(np.quantile(group.state.blur_px, 0.9))
     batch, pixels = layout(image, group, widest, widest)
     cut, pixels = _without_bad_rings(coarse, pixels)
