@@ -108,7 +108,9 @@ def photograph(cell: Cell, rng: np.random.Generator) -> tuple[Scene, Pose]:
     shift = rng.uniform(-0.5, 0.5, 3) * DISTANCE_MM / FOCAL_PX * 4
     pose = Pose(facing @ tilt @ spin, DISTANCE_MM * ray + shift)
     light = Light(ink_grey=INK_GREY, ground_grey=GROUND_GREY, background_grey=GROUND_GREY)
-    scene = Scene(pattern, camera, pose, light=light, sensor=Sensor(psf_sigma_px=cell.blur_px, noise_grey=(GROUND_GREY - INK_GREY) / cell.contrast))
+    scene = Scene(
+        pattern, camera, pose, light=light, sensor=Sensor(psf_sigma_px=cell.blur_px, noise_grey=(GROUND_GREY - INK_GREY) / cell.contrast)
+    )
     turn = rotation_from_vector(np.radians(GUESS_DEG) * _unit(rng))
     return scene, Pose(turn @ pose.rotation, pose.translation_mm + GUESS_MM * _unit(rng))
 
@@ -251,7 +253,11 @@ def worst(outcomes: list[Outcome]) -> None:
     rows = {}
     for cell in dict.fromkeys(o.cell for o in outcomes):
         rows[cell] = row_of([o for o in outcomes if o.cell == cell])
-    named = ("centre efficiency", lambda r: r[5] + 2 * r[6]), ("depth error over bound", lambda r: -r[9]), ("bias of depth", lambda r: -abs(r[11]))
+    named = (
+        ("centre efficiency", lambda r: r[5] + 2 * r[6]),
+        ("depth error over bound", lambda r: -r[9]),
+        ("bias of depth", lambda r: -abs(r[11])),
+    )
     for name, key in named:
         first = sorted(rows, key=lambda c: key(rows[c]))[:8]
         table = [(c.kind, c.radius_px, c.tilt_deg, c.blur_px, c.place, c.contrast, *rows[c]) for c in first]

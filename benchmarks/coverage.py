@@ -136,11 +136,15 @@ def main() -> None:
         shots.append(Shot(drawn.kind, drawn.lens, drawn.bits, drawn.shot_noise, drawn.surface, errors_of(result, picture.truth)))
         _tell_outliers(seed, shots[-1])
     every = join([s.errors for s in shots])
-    print(f"{SEEDS} photographs, {asked} targets wholly in view, {len(every)} measured, {refused} in refused photographs, {wrong} wrong names")
+    print(
+        f"{SEEDS} photographs, {asked} targets wholly in view, {len(every)} measured, {refused} in refused photographs, {wrong} wrong names"
+    )
     header = ("targets", "+-", "x %", "y %", "z %", "u %", "v %", "rms z/s", "rms u/s", "bias z/s", "bias uv/s")
     header = ("of", *header, "normal deg", "claimed", "rms n/s")
     rows = [("all", *row_of(every)), ("no flag", *row_of(select(every, every.quality == 0)))]
-    rows += [(str(f.name).lower(), *row_of(select(every, (every.quality & f) > 0))) for f in Quality if f and ((every.quality & f) > 0).any()]
+    rows += [
+        (str(f.name).lower(), *row_of(select(every, (every.quality & f) > 0))) for f in Quality if f and ((every.quality & f) > 0).any()
+    ]
     for name in ("kind", "lens", "surface", "bits", "shot_noise"):
         for value in sorted({getattr(s, name) for s in shots}):
             rows.append((f"{name} {value}", *row_of(join([s.errors for s in shots if getattr(s, name) == value]))))

@@ -156,7 +156,9 @@ def report_repeat(files: list[Path], results: list[Map], plate: Pattern) -> None
     places = [(result.cloud.ids, result.cloud.center_px) for result in results]
     shape, deviations = common_shape(places, plate)
     seen = np.unique(np.concatenate([index for index, _ in places]))
-    print(f"\nthe print: rms distance of the dots from a perfect lattice {1000 * rms(shape[seen] - plate.center_mm[seen, :2]):.1f} um per axis")
+    print(
+        f"\nthe print: rms distance of the dots from a perfect lattice {1000 * rms(shape[seen] - plate.center_mm[seen, :2]):.1f} um per axis"
+    )
     # homographies and the shape take some of the scatter away
     total = sum(d.size for d in deviations)
     grow = np.sqrt(total / (total - 8 * len(deviations) - 2 * len(seen)))
@@ -169,7 +171,9 @@ def report_repeat(files: list[Path], results: list[Map], plate: Pattern) -> None
         all_px.append(px)
         all_scores.append(px / sigma)
         rows.append((file.stem, 1000 * grow * rms(deviation), 1000 * rms(sigma / scale), rms(px), rms(sigma), rms(px / sigma)))
-    rows.append(("all", 1000 * grow * rms(np.concatenate(deviations)), "", rms(np.concatenate(all_px)), "", rms(np.concatenate(all_scores))))
+    rows.append(
+        ("all", 1000 * grow * rms(np.concatenate(deviations)), "", rms(np.concatenate(all_px)), "", rms(np.concatenate(all_scores)))
+    )
     header = ("frame", "repeats to um", "claimed um", "repeats to px", "claimed px", "rms of error/sigma")
     print_table(header, rows, "Repeatability of the plate's shape, per axis (rms over dots)")
     rows = []
@@ -179,7 +183,9 @@ def report_repeat(files: list[Path], results: list[Map], plate: Pattern) -> None
         d = through(homography(one.center_px[i], two.center_px[j]), one.center_px[i]) - two.center_px[j]
         claimed = np.sqrt(np.einsum("nii->ni", one.covariance_px2[i]) + np.einsum("nii->ni", two.covariance_px2[j]))
         rows.append((f"{a + 1} to {a + 2}", len(common), rms(d) * np.sqrt(d.size / (d.size - 8)), rms(claimed), np.abs(d).max()))
-    print_table(("frames", "dots", "rms px", "claimed px", "largest px"), rows, "From each frame to the next, a homography between them removed")
+    print_table(
+        ("frames", "dots", "rms px", "claimed px", "largest px"), rows, "From each frame to the next, a homography between them removed"
+    )
 
 
 def report_focal(files: list[Path], plate: Pattern, focal_px: float) -> None:
@@ -190,7 +196,11 @@ def report_focal(files: list[Path], plate: Pattern, focal_px: float) -> None:
         _, deviations = common_shape([(r.cloud.ids, r.cloud.center_px) for r in results], plate)
         first = results[0].cloud
         rows.append((factor * focal_px, len(first), 1000 * rms(np.concatenate(deviations)), np.median(first.position_mm[:, 2])))
-    print_table(("focal length px", "measured in the first", "repeats to um", "distance mm"), rows, "The same with other focal lengths (frames 1, 7, 14)")
+    print_table(
+        ("focal length px", "measured in the first", "repeats to um", "distance mm"),
+        rows,
+        "The same with other focal lengths (frames 1, 7, 14)",
+    )
 
 
 def report_program(files: list[Path], results: list[Map], plate: Pattern, camera: Camera) -> None:
@@ -205,7 +215,17 @@ def report_program(files: list[Path], results: list[Map], plate: Pattern, camera
         write_camera(Path(folder) / "camera.yaml", camera)
         for file, result in zip(files, results, strict=True):
             out = Path(folder) / file.stem
-            command = [program, "map", str(file), "--camera", f"{folder}/camera.yaml", "--pattern", f"{folder}/plate.json", "--out", str(out)]
+            command = [
+                program,
+                "map",
+                str(file),
+                "--camera",
+                f"{folder}/camera.yaml",
+                "--pattern",
+                f"{folder}/plate.json",
+                "--out",
+                str(out),
+            ]
             run = subprocess.run(command, capture_output=True, text=True, check=False)
             if run.returncode:
                 rows.append((file.stem, run.returncode, run.stderr.strip()[-160:], ""))

@@ -175,7 +175,9 @@ def stretch_rows(truths: Mapping[str, Truth], found: dict[str, tuple[Errors, Arr
         if rms(mean) < 1e-7:
             continue
         together = np.corrcoef(z, expected)[0, 1], np.corrcoef(errors.normal_rad, unequal)[0, 1]
-        rows.append((name, 1e6 * rms(mean), 1e6 * rms(unequal), rms(z), rms(expected), together[0], rms(errors.sigma_mm[:, 2]), together[1]))
+        rows.append(
+            (name, 1e6 * rms(mean), 1e6 * rms(unequal), rms(z), rms(expected), together[0], rms(errors.sigma_mm[:, 2]), together[1])
+        )
     return rows
 
 
@@ -193,7 +195,22 @@ def one_set(folder: Path) -> None:
         uv = rms(np.linalg.norm(errors.center_px, axis=1))
         theirs.append((name, "dishmap", f"{len(errors)}/{len(pattern)}", uv, rms(z), z.mean(), rms(z - z.mean()), row[9], row[-1]))
         theirs += [(name, *peer) for peer in peers(image, camera, pattern, truth)]
-    header = ("image", "found", "wrong", "centre px", "sigma", "depth mm", "sigma", "bias", "z in 95 %", "uv in 95 %", "normal deg", "sigma", "flags", "s")
+    header = (
+        "image",
+        "found",
+        "wrong",
+        "centre px",
+        "sigma",
+        "depth mm",
+        "sigma",
+        "bias",
+        "z in 95 %",
+        "uv in 95 %",
+        "normal deg",
+        "sigma",
+        "flags",
+        "s",
+    )
     print_table(header, mine, f"data/{folder.name}: rms errors beside claimed sigmas (centre in 2D; normal: median error, rms sigma)")
     header = ("image", "method", "found", "centre px", "depth mm", "bias mm", "scatter mm", "normal deg", "s")
     print_table(header, theirs, f"data/{folder.name}: beside OpenCV, whose user is told the names")

@@ -107,7 +107,7 @@ def api() -> None:
     """Write the API reference: the public names first, then every module."""
     for name in dishmap.__all__:
         getattr(dishmap, name)  # they load when first used, and pdoc shows only what is loaded
-    dishmap.__all__ += [module.name for module in pkgutil.iter_modules(dishmap.__path__)]
+    dishmap.__all__ += [module.name for module in pkgutil.iter_modules(dishmap.__path__) if not module.name.startswith("_")]
     inspect.formatannotation = pdoc.doc.formatannotation = short_type  # type: ignore[assignment]
     pdoc.render.configure(docformat="markdown", footer_text=f"dishmap {dishmap.__version__}")
     pdoc.pdoc("dishmap", output_directory=SITE / "api")

@@ -49,7 +49,7 @@ ORDER = [
     *("io.atomic", "io.image_header", "io.images", "io.picture_file", "io.pose_file", "io.camera_file", "io.pattern_file"),
     *("io.scenario_file", "io.truth_file", "io.points_file", "io.results"),
     # people: what a map says in words, in pictures, on a page
-    *("verdict", "plot.canvas", "plot.photograph", "plot.maps", "plot.outlines", "page", "report"),
+    *("verdict", "plot.canvas", "plot.photograph", "plot.maps", "plot.outlines", "plot.scene", "plot.calibration", "page", "report"),
     # the program
     *("cli.terminal", "cli.options", "cli.outcome", "cli.calibrate", "cli.pattern", "cli.simulate", "cli.undistort"),
     *("cli.map", "cli.demo", "cli.app", "__main__"),
@@ -70,7 +70,7 @@ WALLS = {
     "pydantic_core": ["io"],
 }
 # numpy and scipy may stand anywhere; a library in neither list is not a dependency of this project
-FREE = ["numpy", "scipy"]
+FREE = ["numpy", "scipy", "threadpoolctl"]
 
 # Only these touch the disk.
 DISK = ["io", "cli"]

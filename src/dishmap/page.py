@@ -65,7 +65,21 @@ def page(title: str, body: Iterable[str], scripts: Iterable[str] = ()) -> str:
         f"<style>{STYLE}</style>",
     )
     main = "\n".join([f"<h1>{escape(title)}</h1>", *(part for part in body if part)])
-    return f'<!DOCTYPE html>\n<html lang="en">\n<head>\n{chr(10).join(head)}\n</head>\n<body>\n<main>\n{main}\n</main>\n{code}</body>\n</html>\n'
+    lines = [
+        "<!DOCTYPE html>",
+        '<html lang="en">',
+        "<head>",
+        *head,
+        "</head>",
+        "<body>",
+        "<main>",
+        main,
+        "</main>",
+        f"{code}</body>",
+        "</html>",
+        "",
+    ]
+    return "\n".join(lines)
 
 
 def section(heading: str, *parts: str) -> str:

@@ -6,39 +6,29 @@ The same input gives the same page, byte for byte, with the same versions of the
 from __future__ import annotations
 
 import platform
-from importlib import import_module
-from typing import Any
+from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
 from numpy.typing import NDArray
 
-import dishmap
+from dishmap import __version__
 from dishmap.camera.calibrate import Calibration
 from dishmap.camera.model import Camera
 from dishmap.camera.uncertainty import projection_error
 from dishmap.page import bullet_list, charts, fact_grid, figure, page, paragraph, script_json, section, table, verdict_box
 from dishmap.pipeline import Map
 from dishmap.plot.calibration import coverage_map, view_bars
-from dishmap.plot.canvas import round_length
 from dishmap.plot.maps import normals_map, ratio_histogram, residual_map, sigma_map
 from dishmap.plot.outlines import check_picture, outlines_of, unused_outlines
 from dishmap.plot.photograph import error_svg, photograph_frame, photograph_svg
+from dishmap.plot.scene import exaggeration, scene_of
 from dishmap.quality import MEANING, names
-from dishmap.surface.fit import SurfaceFit, surface_heights
+from dishmap.surface.fit import SurfaceFit
 from dishmap.verdict import Numbers, Verdict, number, numbers_of, rejected_targets, targets, unused_marks, verdict_of
 
 Array = NDArray[np.float64]
 
-LIBRARIES = ("numpy", "scipy", "cv2", "matplotlib", "plotly")
-# Rings and spokes of the surface in the 3D picture: smooth to the eye, and 40 kB.
-RINGS, SPOKES = 24, 73
-# Residuals are drawn so that the largest takes about this part of the surface's width.
-EXAGGERATED_PART = 0.08
-# Where the eye stands, in units of the scene's size: a little above the rim.
-EYE = {"x": 0.55, "y": -1.05, "z": 0.72}
-SCENE_MARGIN = 0.04
-FEW_TICKS = 4
-PLOTLY_DIVERGING = [[0.0, "#053061"], [0.25, "#6aacd0"], [0.5, "#f7f7f7"], [0.75, "#e58368"], [1.0, "#67001f"]]
+LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "matplotlib", "plotly")
 # Rows and columns of the circles of the paper's Fig. 1.
 FIGURE_1_GRID = (9, 12)
 
@@ -72,7 +62,8 @@ def calibration_report(calibration: Calibration, title: str) -> str:
     pixels = np.concatenate([view.pixels for view in views])
     residuals, used = np.concatenate(calibration.residuals_px), np.concatenate(calibration.used)
     headline = f"{len(views)} views fit to {number(calibration.rms_px)} px rms; corners cover {calibration.coverage:.0%} of the picture."
-    notes = [*calibration.notes, *(f"{name} was left out: {reason}." for name, reason in calibration.rejected.items())]
+    notes = [f"{note[:1].upper()}{note[1:]}." for note in calibration.notes]
+    notes += [f"{name} was left out: {reason}." for name, reason in calibration.rejected.items()]
     facts = [
         ("Views used", f"{len(views)} of {len(views) + len(calibration.rejected)}", f"{int(used.sum())} of {len(used)} corners"),
         ("Rms residual", f"{number(calibration.rms_px)} px", "of both coordinates together"),
@@ -141,7 +132,7 @@ def _surface(result: Map, numbers: Numbers) -> str:
     space = '<div id="surface3d" class="plot3d" role="img" aria-label="Interactive picture of the fitted surface with the targets."></div>'
     caption = (
         "The fitted surface with the targets, in the dish frame; turn it with the mouse. Residuals are drawn "
-        f"{_exaggeration(fit, xy):g} times enlarged, or at true scale, as chosen above it. Hovering tells id, position and sigma."
+        f"{exaggeration(fit, xy):g} times enlarged, or at true scale, as chosen above it. Hovering tells id, position and sigma."
     )
     return section(
         "Surface",
@@ -212,12 +203,12 @@ def _calibration_error(camera: Camera, image: NDArray[np.generic] | None) -> str
         return section(heading, paragraph("Not known: the camera file carries no covariance. `dishmap calibrate` writes one that does."))
     error = projection_error(camera, FIGURE_1_GRID)
     shape = projection_error(camera, FIGURE_1_GRID, remove_rotation=True)
-    summary = f"{number(error.rms_px)} px rms over the picture"
+    summary = f"median {number(float(np.nanmedian(error.sigma_px)))} px, rms {number(error.rms_px)} px over the picture"
     svg = error_svg(error, camera.width_px, camera.height_px, f"Map of the expected projection error, {summary}.", image)
     caption = (
         "Radius of each circle: the error to be expected where a known direction is projected, from the calibration's covariance; "
-        f"{summary}. As a rule a small turn of the camera explains most of it: without the turn that fits best, {number(shape.rms_px)} px "
-        "rms are left."
+        f"{summary}. Without the small turn of the camera that explains most of it, {number(shape.rms_px)} px rms are left. "
+        "Orange and dashed: larger than drawn. No circle: the lens model does not reach there."
     )
     return section(heading, figure(svg, caption))
 
@@ -252,16 +243,16 @@ def _table(result: Map, numbers: Numbers) -> str:
 
 
 def _inputs(inputs: dict[str, str]) -> str:
-    versions = [("dishmap", dishmap.__version__), ("Python", platform.python_version())]
-    versions += [(name, str(import_module(name).__version__)) for name in LIBRARIES]
-    rows = [*((str(k), str(v)) for k, v in inputs.items()), *((f"version of {name}", version) for name, version in versions)]
+    versions = [("dishmap", __version__), ("Python", platform.python_version()), *((name, _version(name)) for name in LIBRARIES)]
+    rows = [*inputs.items(), *((f"version of {name}", text) for name, text in versions)]
     return section("Inputs and versions", table(("what", "value"), rows, (0, 1)))
 
 
-def _exaggeration(fit: SurfaceFit, xy_mm: Array) -> float:
-    """A round factor by which residuals are enlarged in the 3D picture, 1 or more."""
-    largest = float(np.abs(fit.residual_mm[~fit.off_surface]).max(initial=0.0))
-    return max(1.0, round_length(EXAGGERATED_PART * float(np.ptp(xy_mm, axis=0).max()) / largest)) if largest > 0 else 1.0
+def _version(library: str) -> str:
+    try:
+        return version(library)
+    except PackageNotFoundError:
+        return "unknown"
 
 
 def _scripts(result: Map, numbers: Numbers) -> list[str]:
@@ -270,126 +261,7 @@ def _scripts(result: Map, numbers: Numbers) -> list[str]:
         return []
     from plotly.offline import get_plotlyjs
 
-    data, layout = _scene(result, numbers, result.surface)
+    data, layout = scene_of(result, numbers, result.surface)
     config = {"displaylogo": False, "responsive": True, "modeBarButtons": [["zoom3d", "pan3d", "orbitRotation", "resetCameraDefault3d"]]}
     call = f'Plotly.newPlot("surface3d",{script_json(data)},{script_json(layout)},{script_json(config)});'
     return [get_plotlyjs(), call]
-
-
-def _scene(result: Map, numbers: Numbers, fit: SurfaceFit) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Traces and layout of the 3D picture: the surface, and the residuals twice, enlarged and at true scale."""
-    position = numbers.dish.position_mm
-    factor = _exaggeration(fit, position[:, :2])
-    on = position[:, 2] - fit.residual_mm
-    height = surface_heights(fit, position[:, 0], position[:, 1]).height_mm
-    foot = np.where(np.isfinite(height), height, on)
-    traces = [_mesh(fit)]
-    for times in (factor, 1.0):
-        top = foot + times * (position[:, 2] - foot)
-        traces += _stems(result, numbers, fit, foot, top, visible=times == factor)
-    choices = [
-        {"label": label, "method": "restyle", "args": [{"visible": [True, *shown, *(not s for s in shown)]}]}
-        for label, shown in ((f"residuals {factor:g} times enlarged", (True, True)), ("true scale", (False, False)))
-    ]
-    font = {"family": "system-ui, DejaVu Sans, Arial, sans-serif", "size": 13, "color": "#1a1a1a"}
-    layout = {
-        "margin": {"l": 0, "r": 0, "t": 40, "b": 0},
-        "font": font,
-        "paper_bgcolor": "#ffffff",
-        "showlegend": False,
-        "scene": _axes_of_scene(position[:, :2], np.concatenate([foot, foot + factor * (position[:, 2] - foot)])),
-        "updatemenus": [
-            {"type": "buttons", "direction": "right", "x": 0, "xanchor": "left", "y": 1.06, "yanchor": "top", "buttons": choices}
-        ],
-    }
-    return traces, layout
-
-
-def _axes_of_scene(xy_mm: Array, z_mm: Array) -> dict[str, Any]:
-    """Axes with one scale for x, y and z, the longest of length 1."""
-    low, high = np.array([*xy_mm.min(axis=0), z_mm.min()]), np.array([*xy_mm.max(axis=0), z_mm.max()])
-    low, high = low - SCENE_MARGIN * (high - low).max(), high + SCENE_MARGIN * (high - low).max()
-    axes: dict[str, Any] = {
-        f"{name}axis": {"title": {"text": f"{name} (mm)"}, "range": [round(float(a), 3), round(float(b), 3)]}
-        for name, a, b in zip("xyz", low, high, strict=True)
-    }
-    # a short axis has no room for many numbers
-    axes["zaxis"]["nticks"] = FEW_TICKS
-    ratio = {name: round(float(length), 4) for name, length in zip("xyz", (high - low) / (high - low).max(), strict=True)}
-    return {**axes, "aspectmode": "manual", "aspectratio": ratio, "camera": {"eye": EYE, "center": {"x": 0, "y": 0, "z": -0.05}}}
-
-
-def _mesh(fit: SurfaceFit) -> dict[str, Any]:
-    """The fitted surface within the outline of its points, on rings from the middle outwards."""
-    middle = fit.hull_mm.mean(axis=0)
-    angle = np.linspace(0.0, 2 * np.pi, SPOKES)
-    direction = np.column_stack([np.cos(angle), np.sin(angle)])
-    edge = np.roll(fit.hull_mm, -1, axis=0) - fit.hull_mm
-    outward = np.column_stack([edge[:, 1], -edge[:, 0]])
-    # a spoke ends at the first edge of the convex outline that it meets
-    speed = direction @ outward.T
-    room = np.where(speed > 1e-12, ((fit.hull_mm - middle) * outward).sum(axis=1) / np.where(speed > 1e-12, speed, 1.0), np.inf)
-    spokes = direction * room.min(axis=1)[:, None]
-    x, y = np.moveaxis(middle + np.linspace(0.0, 1.0, RINGS)[:, None, None] * spokes, -1, 0)
-    height = surface_heights(fit, x, y).height_mm
-    return {
-        "type": "surface",
-        "x": _listed(x, 2),
-        "y": _listed(y, 2),
-        "z": _listed(height, 4),
-        "showscale": False,
-        "opacity": 0.85,
-        "colorscale": [[0, "#6fa8cf"], [1, "#d3e5f2"]],
-        "hoverinfo": "skip",
-        "contours": {axis: {"highlight": False} for axis in "xyz"},
-    }
-
-
-def _stems(result: Map, numbers: Numbers, fit: SurfaceFit, foot: Array, top: Array, visible: bool) -> list[dict[str, Any]]:
-    """Lines from the surface to the targets, and the targets as dots coloured by residual."""
-    x, y, _ = numbers.dish.position_mm.T
-    gap = np.full_like(x, np.nan)
-    line = [_listed(np.column_stack(three).ravel(), 4) for three in ((x, x, gap), (y, y, gap), (foot, top, gap))]
-    limit = float(np.abs(fit.residual_mm[~fit.off_surface]).max(initial=0.0)) or 1.0
-    dots = {
-        "color": _listed(fit.residual_mm, 5),
-        "colorscale": PLOTLY_DIVERGING,
-        "cmin": -limit,
-        "cmax": limit,
-        "size": 4.5,
-        "line": {"color": "#1a1a1a", "width": 1},
-        "colorbar": {"title": {"text": "residual (mm)"}, "thickness": 16, "len": 0.7},
-    }
-    shared = {"type": "scatter3d", "visible": visible}
-    lines = {"mode": "lines", "hoverinfo": "skip", "x": line[0], "y": line[1], "z": line[2], "line": {"color": "#555555", "width": 3}}
-    points = {
-        "mode": "markers",
-        "marker": dots,
-        "x": _listed(x, 4),
-        "y": _listed(y, 4),
-        "z": _listed(top, 4),
-        "text": _hover_texts(result, numbers, fit),
-        "hovertemplate": "%{text}<extra></extra>",
-    }
-    return [shared | lines, shared | points]
-
-
-def _hover_texts(result: Map, numbers: Numbers, fit: SurfaceFit) -> list[str]:
-    out = []
-    for n, (x, y, z) in enumerate(numbers.dish.position_mm.tolist()):
-        lines = [
-            f"target {result.cloud.ids[n]}",
-            f"x {x:.3f}, y {y:.3f}, z {z:.3f} mm (dish frame)",
-            f"residual {fit.residual_mm[n]:.4f} mm",
-        ]
-        if numbers.sigma_depth_mm is not None:
-            lines.append(f"sigma of depth {number(float(numbers.sigma_depth_mm[n]))} mm")
-        out.append("<br>".join(lines))
-    return out
-
-
-def _listed(values: Array, digits: int) -> list[Any]:
-    """Nested lists of rounded numbers, None for NaN, for JSON."""
-    rounded = np.round(values, digits).astype(object)
-    rounded[~np.isfinite(values)] = None
-    return list(rounded.tolist())

@@ -130,7 +130,7 @@ def test_all_targets_clipped(tmp_path: Path) -> None:
     ("edit", "message"),
     [
         (lambda p: p["target_kinds"]["multi"]["circles"][0].update(radius_mm=-5), "radius_mm"),
-        (lambda p: p["target_kinds"]["multi"]["circles"][0].update(radius_mm=float("nan")), "NaN"),
+        (lambda p: p["target_kinds"]["multi"]["circles"][0].update(radius_mm=float("nan")), "must be a finite number, not nan"),
         (lambda p: p["targets"][3].update(center_mm=[1, 2, float("inf")]), "must be a finite number"),
         (lambda p: p["targets"][3].update(centre_mm=[1, 2, 3]), "unknown key 'centre_mm'.*'center_mm'"),
         (lambda p: p.update(targets=[]), "targets"),

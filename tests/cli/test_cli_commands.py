@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -33,8 +34,8 @@ from dishmap.targets.builders import KIND_BUILDERS
 from dishmap.targets.symmetry import symmetry_poses
 
 ROOT = Path(__file__).resolve().parents[2]
-# What a person does not notice; a busy machine has three tries.
-LONGEST_HELP_SECONDS, TRIES = 0.4, 3
+# Of the processor's time, which a busy machine does not change.
+LONGEST_HELP_SECONDS = 0.4
 HEAVY = ("cv2", "scipy", "pydantic", "matplotlib", "plotly", "rich", "numpy")
 
 
@@ -47,22 +48,17 @@ def start(*words: object, **options: object) -> subprocess.Popen[str]:
 
 
 def test_help_comes_at_once() -> None:
-    seconds = []
-    for _ in range(TRIES):
-        begin = time.perf_counter()
-        said, _ = start("--help").communicate()
-        seconds.append(time.perf_counter() - begin)
-        assert all(name in said for name in ("calibrate", "demo", "map", "pattern", "simulate", "undistort"))
-        if seconds[-1] < LONGEST_HELP_SECONDS:
-            break
-    assert min(seconds) < LONGEST_HELP_SECONDS
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    said, _ = start("--help").communicate()
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert all(name in said for name in ("calibrate", "demo", "map", "pattern", "simulate", "undistort"))
+    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < LONGEST_HELP_SECONDS
 
 
 def test_help_loads_nothing_heavy() -> None:
     code = f"import sys, dishmap.cli.app; print([name for name in {HEAVY} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env={"PYTHONPATH": str(ROOT / "src")})
-    # the calibrate and demo commands compute with numpy in their own words, which is as light as it gets
-    assert done.stdout.strip() in ("[]", "['numpy']")
+    assert done.stdout.strip() == "[]"
 
 
 def test_version_and_the_installed_name() -> None:
@@ -98,7 +94,8 @@ def test_a_reader_that_goes_away_is_no_error(shot: Path, tmp_path: Path) -> None
     assert process.stdout is not None
     process.stdout.close()
     assert process.stderr is not None
-    assert process.stderr.read() == ""
+    with process.stderr:
+        assert process.stderr.read() == ""
     process.wait()
 
 
@@ -115,7 +112,8 @@ def test_patterns_of_every_kind(kind: str, tmp_path: Path) -> None:
     words = ["pattern", "plate", "--rows", 3, "--columns", 4, "--pitch-mm", 40, "--kind", kind, *sizes, "--out", out]
     done = dishmap(*words)
     assert done.exit_code == 0, done.stderr
-    assert "looks the same after 1 turn" in done.stdout
+    # three on a triangle show which way is up
+    assert ("looks the same after 1 turn" in done.stdout) == (kind != "multi")
     made = read_pattern(out)
     assert len(made) == 12
     radii = {"disc": [6], "ring": [6, 4], "concentric": [6, 4.5, 2], "multi": [4, 4, 4], "whycon": [6, 3]}[kind]
@@ -194,7 +192,10 @@ def board_photographs(folder: Path) -> list[Path]:
         # the board's picture has 4 px a mm and its middle at (240, 200)
         to_mm = np.array([[0.25, 0, -60], [0, 0.25, -50], [0, 0, 1]])
         homography = matrix @ np.column_stack([rotation[:, :2], [0, 0, 230]]) @ to_mm
-        view = cv2.warpPerspective(board, homography, (640, 480), flags=cv2.INTER_AREA, borderValue=220)
+        # four times as many pixels both ways, then their means: no aliasing
+        finer = np.array([[4.0, 0, 1.5], [0, 4.0, 1.5], [0, 0, 1]])
+        view = cv2.warpPerspective(board, finer @ homography, (2560, 1920), flags=cv2.INTER_LINEAR, borderValue=220)
+        view = cv2.resize(view, (640, 480), interpolation=cv2.INTER_AREA)
         light = cv2.GaussianBlur(view, (0, 0), 0.8).astype(np.float32)
         names.append(folder / f"view{number}.png")
         cv2.imwrite(str(names[-1]), record(light, Sensor(noise_grey=1.0), np.random.default_rng(number)))

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-import numpy as np
 
 from dishmap.cli.options import PATH, POSITIVE, Grid, out_file, refuse_overwriting
 from dishmap.cli.terminal import progress, say, table
@@ -64,6 +63,8 @@ def _photographs(photos: Sequence[Path], names: Sequence[str]) -> Iterator[tuple
 
 
 def _report(result: Calibration, not_found: dict[str, str], names: Sequence[str], out: Path) -> None:
+    import numpy as np
+
     from dishmap.transforms import angle_between_rad
 
     camera = result.camera

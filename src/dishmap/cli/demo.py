@@ -7,19 +7,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-import numpy as np
-from numpy.typing import NDArray
 
 from dishmap.cli.outcome import print_summary, write_outcome
 from dishmap.cli.simulate import CAMERA, PATTERN, TRUTH
 from dishmap.cli.terminal import progress, say, table
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from dishmap.pipeline import Map
     from dishmap.simulate.scene import Scene
     from dishmap.simulate.truth import Truth
 
-Array = NDArray[np.float64]
+    Array = NDArray[np.float64]
 
 PHOTOGRAPH = "photograph.png"
 SEED = 1
@@ -33,6 +34,8 @@ WITHIN = 1.96
 )
 def demo_command(out: Path) -> None:
     """Photograph a simulated 0.6 m dish (4608x3456 px), map it, and compare with the truth."""
+    import numpy as np
+
     from dishmap.io.atomic import output_folder, write_files
     from dishmap.io.camera_file import camera_text, read_camera
     from dishmap.io.images import read_gray
@@ -71,6 +74,8 @@ def demo_command(out: Path) -> None:
 
 def demo_scene() -> Scene:
     """A 0.6 m dish of f/D 0.5, 665 mm in front of a 16-megapixel camera with a wide lens, tilted, in uneven light, with clutter."""
+    import numpy as np
+
     from dishmap.camera.model import Camera
     from dishmap.simulate.scene import Light, Scene, Sensor, facing_pose, random_shapes
     from dishmap.targets.builders import dish
@@ -89,6 +94,8 @@ def demo_scene() -> Scene:
 
 def comparison(result: Map, truth: Truth) -> str:
     """A table of errors against truth beside the sigmas claimed, rms over the targets, and how many lie within 1.96 sigma."""
+    import numpy as np
+
     from dishmap.transforms import angle_between_rad
 
     cloud = result.cloud
@@ -106,9 +113,9 @@ def comparison(result: Map, truth: Truth) -> str:
 
 
 def _row(name: str, error: Array, sigma: Array) -> list[str]:
-    inside = float((np.abs(error) <= WITHIN * sigma).mean())
+    inside = float((abs(error) <= WITHIN * sigma).mean())
     return [name, f"{_rms(error):.4f}", f"{_rms(sigma):.4f}", f"{inside:.0%}"]
 
 
 def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+    return float((values**2).mean()) ** 0.5

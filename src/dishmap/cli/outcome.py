@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
 from dishmap.cli.terminal import say
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from dishmap.io.results import Provenance
     from dishmap.pipeline import Map
 
@@ -76,6 +76,8 @@ def _basis(result: Map) -> str:
 
 
 def _print_sigmas(result: Map) -> None:
+    import numpy as np
+
     from dishmap.io.results import shared_calibration
     from dishmap.targets.pose import TargetPoses
 

@@ -102,10 +102,12 @@ def _word(name: str) -> str:
 
 
 def _write(pattern: Pattern, out: Path) -> None:
+    from dishmap.io.atomic import output_folder
     from dishmap.io.pattern_file import write_pattern
     from dishmap.targets.symmetry import symmetry_poses
 
-    write_pattern(out, pattern)
+    with output_folder(out.parent):
+        write_pattern(out, pattern)
     say(f"{out}: {len(pattern)} targets ({', '.join(pattern.kinds)})")
     same = len(symmetry_poses(pattern))
     if same:

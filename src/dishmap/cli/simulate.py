@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-import numpy as np
 
 from dishmap.cli.options import CAMERA_KEY, PATH, out_folder
 from dishmap.cli.terminal import Tell, progress, say
@@ -53,6 +52,8 @@ class Shots(Mapping[str, str | bytes]):
         return self._photograph(name)
 
     def _photograph(self, name: str) -> bytes:
+        import numpy as np
+
         from dishmap.io.picture_file import picture_bytes
         from dishmap.simulate.render import simulate
 
@@ -80,7 +81,7 @@ def simulate_command(scenario: Path, out: Path) -> None:
         write_files(out, files)
     for name, truth in files.truths:
         whole = int((truth.visible_fraction > 0.999).sum())
-        moved = float(np.sqrt(np.mean(truth.displacement_mm**2)))
+        moved = float((truth.displacement_mm**2).mean()) ** 0.5
         say(f"{out / name}: {whole} of {len(truth)} targets wholly visible, displacement {moved:.3g} mm rms")
     say(f"truth: {out / TRUTH}")
     first = files.truths[0][0]

@@ -35,7 +35,7 @@ def picture_bytes(image: NDArray[np.generic], suffix: str = ".png") -> bytes:
     if image.dtype.itemsize * 8 > FORMATS[suffix]:
         raise InputError(f"{suffix} files hold {FORMATS[suffix]} bits and the picture has 16; write .png or .tif")
     try:
-        done, data = cv2.imencode(suffix, image, QUALITY.get(suffix, []))
+        done, data = cv2.imencode(suffix, image, QUALITY.get(suffix, []))  # type: ignore[arg-type]  # uint8 or uint16 by now
     except cv2.error as error:
         raise InputError(f"a picture of {image.shape[1]}x{image.shape[0]} px cannot be written as {suffix}: {error.err}") from error
     if not done:

@@ -251,9 +251,7 @@ def _sha256(path: str | Path) -> str:
         with Path(path).open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
-        raise InputError(
-            f"{path} could be read before but not any more ({error.strerror}); leave inputs in place while they are mapped"
-        ) from error
+        raise InputError(f"{path} can no longer be read ({error.strerror}); leave inputs in place until all is done") from error
 
 
 def _list(values: Array) -> Any:

@@ -78,12 +78,11 @@ def normals_map(xy_mm: Array, lean_rad: Array, reference: str) -> Figure:
     typical = float(np.quantile(length_deg, ARROW_QUANTILE)) or float(length_deg.max()) or 1.0
     long = length_deg > LONGEST_SHOWN * typical
     shown = np.where(long[:, None], lean_deg * (LONGEST_SHOWN * typical / np.maximum(length_deg, typical))[:, None], lean_deg)
-    scale = typical / (LONGEST_ARROW * _span(xy_mm))
     axes.scatter(xy_mm[:, 0], xy_mm[:, 1], s=7, c=FAINT, zorder=2)
     style: dict[str, Any] = {
-        "angles": "xy",
-        "scale_units": "xy",
-        "scale": scale,
+        "angles": "uv",
+        "scale_units": "width",
+        "scale": typical / LONGEST_ARROW,
         "width": 0.004,
         "headwidth": 4,
         "headlength": 4.5,

@@ -15,7 +15,7 @@ from matplotlib.colors import Normalize
 from numpy.typing import NDArray
 
 from dishmap.camera.uncertainty import ProjectionError
-from dishmap.plot.canvas import BLUE, FAINT, INK, RED, Array, color_norm, hex_colors, round_length
+from dishmap.plot.canvas import BLUE, FAINT, INK, ORANGE, RED, Array, color_norm, hex_colors, round_length
 
 BOX = (1600.0, 1200.0)
 JPEG_QUALITY = 76
@@ -25,12 +25,14 @@ LEGEND_HEIGHT = 92.0
 # What is shown about the pattern, as a part of its size.
 CROP_MARGIN = 0.12
 # Letters between these sizes; where targets stand too close for the smaller, ids show on hovering only.
-SMALLEST_TEXT, LARGEST_TEXT = 8.0, 20.0
+SMALLEST_TEXT, LARGEST_TEXT = 8.0, 24.0
 # Width of a digit over its height, and the part of a target's spacing that its id may take.
 DIGIT_WIDTH, TEXT_PART = 0.6, 0.4
 WHITE_PERCENTILE = 99.5
 # The largest circle of expected error takes this part of the spacing of the grid.
 CIRCLE_PART = 0.48
+# ... and stands for at most so many times the median error.
+LARGEST_TIMES_MEDIAN = 4.0
 
 
 @dataclass(frozen=True)
@@ -108,15 +110,16 @@ def error_svg(error: ProjectionError, width_px: int, height_px: int, alt: str, i
     frame = frame_of(width_px, height_px)
     sigma, at = error.sigma_px.ravel(), frame.place(error.pixels.reshape(-1, 2))
     spacing = min(frame.height / error.pixels.shape[0], frame.width / error.pixels.shape[1])
-    largest = float(np.nanmax(sigma))
+    # corners where the lens is extrapolated must not shrink all other circles to dots
+    largest = min(float(np.nanmax(sigma)), LARGEST_TIMES_MEDIAN * float(np.nanmedian(sigma)))
     units_per_px = CIRCLE_PART * spacing / largest if largest > 0 else 1.0
     back = f'<rect width="{frame.width:.1f}" height="{frame.height:.1f}" fill="#ffffff" stroke="{FAINT}"/>'
     if image is not None:
         back += f'<g opacity="0.45">{_picture(image, frame, BACKGROUND_QUALITY, BACKGROUND_PART)}</g>'
+    known = np.isfinite(sigma)
     circles = "".join(
-        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{max(s * units_per_px, 0.5):.1f}"><title>{s:.3g} px</title></circle>'
-        for (x, y), s in zip(at.tolist(), sigma.tolist(), strict=True)
-        if np.isfinite(s)
+        _error_circle(x, y, s, min(s, largest) * units_per_px, s > largest)
+        for (x, y), s in zip(at[known].tolist(), sigma[known].tolist(), strict=True)
     )
     marks = f'<g fill="none" stroke="#ffffff" stroke-width="5" opacity="0.7">{circles}</g>' if image is not None else ""
     marks += f'<g fill="{BLUE}" fill-opacity="0.15" stroke="{BLUE}" stroke-width="2.2">{circles}</g>'
@@ -128,6 +131,12 @@ def error_svg(error: ProjectionError, width_px: int, height_px: int, alt: str, i
         f'<text x="{2 * radius + 14:.1f}" y="{middle + 8:.1f}" font-size="24" fill="{INK}">{meaning}</text>'
     )
     return _svg(frame, margin, LEGEND_HEIGHT, alt, [back, marks, legend])
+
+
+def _error_circle(x: float, y: float, sigma_px: float, radius: float, cut: bool) -> str:
+    """One circle of expected error; orange and dashed where it is drawn smaller than it is."""
+    style = f' stroke="{ORANGE}" stroke-dasharray="8 6"' if cut else ""
+    return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{max(radius, 0.5):.1f}"{style}><title>{sigma_px:.3g} px</title></circle>'
 
 
 def _svg(frame: Frame, around: float, below: float, alt: str, body: list[str]) -> str:

@@ -140,7 +140,7 @@ def adjust(batch: Batch, pixels: RingPixels, poses: Poses, state: State, weighti
         if share >= enough or step == steps:
             break
         if share > MOST_CONVERGED:
-            return _with_rest(batch, pixels, fit, weighting, steps - step)
+            return with_rest(batch, pixels, fit, weighting, steps - step)
         # the motion fields only steer: they are made anew when targets turn, not at every step
         maps = batch.maps(poses, pixels.patches, None if turning else maps)
     return fit
@@ -171,7 +171,7 @@ def _one_step(batch: Batch, pixels: RingPixels, poses: Poses, state: State, weig
     return Adjusted(poses, state, information, data, good, sums, residual, variance), turning
 
 
-def _with_rest(batch: Batch, pixels: RingPixels, fit: Adjusted, weighting: Weighting, steps: int) -> Adjusted:
+def with_rest(batch: Batch, pixels: RingPixels, fit: Adjusted, weighting: Weighting, steps: int) -> Adjusted:
     """`fit` with the targets that have not converged adjusted further."""
     rest = ~fit.converged
     rings = rest[pixels.target]

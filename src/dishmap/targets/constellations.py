@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.targets.candidates import Candidates
-from dishmap.targets.ellipses import invert_2x2
+from dishmap.targets.ellipses import invert_2x2, root_det
 from dishmap.targets.layout import Layout
 
 Array = NDArray[np.float64]
@@ -60,7 +60,7 @@ def match_neighbourhood(candidates: Candidates, seed: int, near: Index, layout: 
     none = Hypotheses(seed, np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.int64), np.zeros(0))
     if len(q) < FEWEST_VOTES - 1:
         return none
-    size = np.sqrt(np.abs(np.linalg.det(candidates.shape[near]) / np.linalg.det(candidates.shape[seed])))
+    size = root_det(candidates.shape[near]) / root_det(candidates.shape[seed])
     marks = np.flatnonzero(candidates.is_type[seed, layout.type_index])
     if not len(marks):
         return none

@@ -22,6 +22,8 @@ Array = NDArray[Any]
 # Degrees of the pixel -> plane polynomial: the first is used unless it leaves more than MISFIT_PX anywhere on its nodes.
 PLANE_DEGREES = (3, 5)
 MISFIT_PX = 2e-4
+# Square of d plane / d pixel (mm/px) below which there is no direction: only at a circle's very centre.
+SMALLEST_SLOPE = 1e-20
 # Degree of the motion fields: they only steer the fit and give its Fisher information.
 MOTION_DEGREE = 2
 
@@ -203,11 +205,11 @@ def edge_distance(six: NDArray[Any], center_mm: NDArray[Any], radius_mm: NDArray
     inverse = 1 / np.maximum(rho, 1e-6)
     ex, ey = dx * inverse, dy * inverse
     gu, gv = ex * xu + ey * yu, ex * xv + ey * yv
-    px_per_mm = 1 / np.sqrt(gu * gu + gv * gv)
+    px_per_mm = 1 / np.sqrt(np.maximum(gu * gu + gv * gv, SMALLEST_SLOPE))
     nu, nv = gu * px_per_mm, gv * px_per_mm
     wx, wy = xu * nu + xv * nv, yu * nu + yv * nv
     along = wx * dx + wy * dy
-    speed = wx * wx + wy * wy
+    speed = np.maximum(wx * wx + wy * wy, SMALLEST_SLOPE)
     root = along * along + speed * (radius * radius - rho * rho)
     distance = (np.sqrt(np.maximum(root, 0)) - along) / speed
     # |J t| for the tangent t, which has no radial part: det J / |grad rho|

@@ -49,6 +49,11 @@ def invert_2x2(m: Array) -> Array:
     return matrices_2x2(d, -b, -c, a) / (a * d - b * c)[..., None, None]
 
 
+def root_det(m: Array) -> Array:
+    """Root of the absolute determinant of matrices (..., 2, 2): the mean scale of a map."""
+    return np.asarray(np.sqrt(np.abs(m[..., 0, 0] * m[..., 1, 1] - m[..., 0, 1] * m[..., 1, 0])))
+
+
 def ellipse_matrices(semi_axes: Array, angle_rad: Array) -> Array:
     """Symmetric matrices (M, 2, 2) that map the unit circle to each ellipse about its centre."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from dishmap.camera.model import Camera
 from dishmap.targets.candidates import Candidates
-from dishmap.targets.ellipses import invert_2x2
+from dishmap.targets.ellipses import invert_2x2, root_det
 from dishmap.targets.layout import Layout
 from dishmap.targets.markgrid import MarkGrid
 from dishmap.targets.rigid import STEPS, RigidFit, other_tilt, pose_jacobians, robust_pose, unbent_misfit
@@ -40,10 +40,10 @@ RIGID_SIGMA = 0.05
 # Where it has no matched neighbour at all, the surface must so far be this stiff, and the mark not beyond this many times the
 # reach of the matches: what bending they hide grows with the square of the distance.
 STIFF_PART, STIFF_REACH = 0.015, 1.6
-# Ridge of the local correction: weight of "no offset" and of "no gradient", in matched neighbours.
-RIDGE_OFFSET, RIDGE_GRADIENT = 0.05, 0.3
-# Look-alikes count within this many spacings.
-STRANGER_PART = 1.5
+# Ridge of the local correction: weight of "no offset", "no gradient" and "the usual size", in matched neighbours.
+RIDGE_OFFSET, RIDGE_GRADIENT, RIDGE_SIZE = 0.005, 0.05, 0.1
+# Look-alikes count within this many spacings, up to this ratio of sizes.
+STRANGER_PART, STRANGER_SIZE = 1.5, 1.3
 MOST_WAVES = 60
 # Waves without progress after which growth ends; the tilt's other sign is tried in the first waves, when the patch is small.
 IDLE_WAVES = 3
@@ -74,16 +74,17 @@ class Prediction:
     """Where and how each mark should be seen (K): from the rigid pose and its matched neighbours, never from itself.
 
     predicted_px (K, 2), NaN where it cannot be seen; affine (K, 2, 2): px per mm of the mark's own plane; support (K,):
-    matched neighbours; residual_mm (K,): of each match, in the mark's plane, NaN without a match; log_size (K,): log of seen
-    over predicted size less its median `log_ratio`; known (K,): the prediction can be trusted.
+    matched neighbours; residual_mm (K,): of each match, in the mark's plane, NaN without a match; log_ratio (K,): log of
+    seen over predicted size that the neighbours let expect (ink spread, threshold, a bent surface); log_size (K,): what the
+    match has beyond that; known (K,): the prediction can be trusted.
     """
 
     predicted_px: Array
     affine: Array
     support: Index
     residual_mm: Array
+    log_ratio: Array
     log_size: Array
-    log_ratio: float
     known: Flags
 
 
@@ -196,7 +197,7 @@ def _predict(scene: Scene, fit: RigidFit, match: Index) -> Prediction:
     # how well the rigid pose itself places each mark
     by_pose = by_point @ pose_jacobians(fit.pose, layout.center_mm, fit.middle_mm)
     rigid_px = np.sqrt(np.maximum(((by_pose @ fit.covariance) * by_pose).sum(axis=(1, 2)), 0.0))
-    scale = _root_det(affine)
+    scale = root_det(affine)
     with np.errstate(invalid="ignore", divide="ignore"):
         rigid = (rigid_px < RIGID_SIGMA * scale * layout.spacing_mm) & (fit.sigma_px < 2 * RIGID_SIGMA * scale * layout.spacing_mm)
         stiff = (fit.sigma_px < STIFF_PART * scale * layout.spacing_mm) & _within_reach(layout.center_mm, matched)
@@ -204,9 +205,24 @@ def _predict(scene: Scene, fit: RigidFit, match: Index) -> Prediction:
         size = scale * layout.radius_mm
         log_size = np.where(matched, np.log(candidates.size_px[match] / size), np.nan)
         in_plane = np.einsum("kij,kj->ki", invert_2x2(affine), candidates.center_px[match] - predicted)
-    ratio = float(np.nanmedian(log_size)) if matched.any() else 0.0
+    log_ratio = _local_ratio(layout, matched, log_size)
     distance = np.where(matched, np.linalg.norm(in_plane, axis=1), np.nan)
-    return Prediction(predicted, affine, support, distance, log_size - ratio, ratio, known)
+    return Prediction(predicted, affine, support, distance, log_ratio, log_size - log_ratio, known)
+
+
+def _local_ratio(layout: Layout, matched: Flags, log_size: Array) -> Array:
+    """Mean (K,) of the matched neighbours' log sizes, drawn a little to the median of all."""
+    middle = float(np.median(log_size[matched])) if matched.any() else 0.0
+    weight = _neighbour_weights(layout, matched)
+    total = (weight * np.nan_to_num(log_size)[layout.neighbour]).sum(axis=1) + RIDGE_SIZE * middle
+    return np.asarray(total / (weight.sum(axis=1) + RIDGE_SIZE))
+
+
+def _neighbour_weights(layout: Layout, matched: Flags) -> Array:
+    """Weight (K, N) of each neighbour: near ones count most, those without a match not at all."""
+    near = matched[layout.neighbour] & (layout.neighbour >= 0)
+    place = np.nan_to_num(layout.offset_mm) / layout.spacing_mm[:, None, None]
+    return near / (1 + (place**2).sum(axis=2) ** 2)
 
 
 def _within_reach(places: Array, matched: Flags) -> Flags:
@@ -216,11 +232,6 @@ def _within_reach(places: Array, matched: Flags) -> Flags:
     return np.asarray(distance <= STIFF_REACH * distance[matched].max())
 
 
-def _root_det(matrices: Array) -> Array:
-    """Root of the absolute determinant of matrices (..., 2, 2): the mean scale of a map."""
-    return np.asarray(np.sqrt(np.abs(matrices[..., 0, 0] * matrices[..., 1, 1] - matrices[..., 0, 1] * matrices[..., 1, 0])))
-
-
 def _local_correction(layout: Layout, matched: Flags, residual: Array) -> tuple[Array, Array, Index]:
     """Offset (K, 2) px, gradient (K, 2, 2) px per mm, and number (K,) of matched neighbours behind them.
 
@@ -228,11 +239,11 @@ def _local_correction(layout: Layout, matched: Flags, residual: Array) -> tuple[
     """
     k = len(layout)
     offset, gradient = np.zeros((k, 2)), np.zeros((k, 2, 2))
-    near = matched[layout.neighbour] & (layout.neighbour >= 0)
-    support = near.sum(axis=1)
+    weight = _neighbour_weights(layout, matched)
+    support = (weight > 0).sum(axis=1)
     rows = np.flatnonzero(support)
+    weight = weight[rows]
     place = np.nan_to_num(layout.offset_mm[rows]) / layout.spacing_mm[rows, None, None]
-    weight = near[rows] / (1 + (place**2).sum(axis=2))
     columns = np.concatenate([np.ones((*place.shape[:2], 1)), place], axis=2)
     weighted = np.swapaxes(columns * weight[..., None], 1, 2)
     normal = weighted @ columns + np.diag([RIDGE_OFFSET, RIDGE_GRADIENT, RIDGE_GRADIENT])
@@ -245,7 +256,7 @@ def _local_correction(layout: Layout, matched: Flags, residual: Array) -> tuple[
 def is_clean(layout: Layout, placement: Embedding) -> bool:
     """Whether a pose and bending along the normal explain the matches, to a small part of the spacing."""
     matched = placement.candidate >= 0
-    scale = _root_det(placement.prediction.affine[matched])
+    scale = root_det(placement.prediction.affine[matched])
     return bool(placement.misfit_px < CLEAN_PART * np.median(scale * layout.spacing_mm[matched]))
 
 
@@ -255,7 +266,7 @@ def limits_mm(scene: Scene, prediction: Prediction, final: bool) -> Array:
     loose = GATE_SPACING * layout.spacing_mm
     if not final:
         return loose
-    scale = _root_det(np.nan_to_num(prediction.affine))
+    scale = root_det(np.nan_to_num(prediction.affine))
     trusted = prediction.residual_mm[prediction.known & np.isfinite(prediction.residual_mm)]
     sigma = 1.4826 * float(np.median(trusted)) if len(trusted) else 0.0
     tight = np.maximum(GATE_RADIUS * layout.radius_mm, GATE_SIGMAS * sigma)
@@ -264,7 +275,7 @@ def limits_mm(scene: Scene, prediction: Prediction, final: bool) -> Array:
 
 def size_limits(layout: Layout, prediction: Prediction) -> Array:
     """Largest difference (K,) of log sizes between a match and its prediction."""
-    size = _root_det(np.nan_to_num(prediction.affine)) * layout.radius_mm
+    size = root_det(np.nan_to_num(prediction.affine)) * layout.radius_mm
     return np.log1p(SIZE_TOLERANCE + SIZE_TOLERANCE_PX / np.maximum(size, 1.0))
 
 
@@ -284,30 +295,45 @@ def _trusted(scene: Scene, prediction: Prediction, match: Index) -> Index:
 
     A part of the pattern that is matched one mark off has such circles all around it.
     """
-    candidates = scene.candidates
-    seen = np.isfinite(prediction.predicted_px).all(axis=1)
-    spacing = np.where(seen, _root_det(np.nan_to_num(prediction.affine)) * scene.layout.spacing_mm, 0.0)
-    places = np.where(seen[:, None], prediction.predicted_px, 1e9)
-    distance, nearest = cKDTree(places).query(candidates.center_px)
-    expected_size = spacing[nearest] / scene.layout.spacing_mm[nearest] * scene.layout.radius_mm[nearest] * np.exp(prediction.log_ratio)
-    with np.errstate(divide="ignore"):
-        like = candidates.is_type.any(axis=1) & (np.abs(np.log(candidates.size_px / expected_size)) < np.log(1.3))
-    like &= distance < STRANGER_PART * spacing[nearest]
+    centers = scene.candidates.center_px
+    like = _look_alikes(scene, prediction)
+    radius_of = STRANGER_PART * root_det(np.nan_to_num(prediction.affine)) * scene.layout.spacing_mm
     for _ in range(MOST_WAVES):
         marks = np.flatnonzero(match >= 0)
         strange = like.copy()
         strange[match[marks]] = False
         if not strange.any() or not len(marks):
             break
-        places, radius = candidates.center_px[match[marks]], STRANGER_PART * spacing[marks]
-        strangers = cKDTree(candidates.center_px[strange]).query_ball_point(places, radius, return_length=True)
+        places, radius = centers[match[marks]], radius_of[marks]
+        around = cKDTree(centers[strange]).query_ball_point(places, radius, return_length=True)
         fitting = cKDTree(places).query_ball_point(places, radius, return_length=True) - 1
-        bad = strangers > np.maximum(fitting, 1)
+        bad = around > np.maximum(fitting, 1)
         if not bad.any():
             break
         match = match.copy()
         match[marks[bad]] = -1
     return match
+
+
+def _look_alikes(scene: Scene, prediction: Prediction) -> Flags:
+    """Candidates (N,) that look like marks in type and size and lie among the predicted marks."""
+    layout, candidates = scene.layout, scene.candidates
+    seen = np.flatnonzero(np.isfinite(prediction.predicted_px).all(axis=1))
+    if not len(seen):
+        return np.zeros(len(candidates), dtype=bool)
+    distance, nearest = cKDTree(prediction.predicted_px[seen]).query(candidates.center_px)
+    mark = seen[nearest]
+    scale = root_det(prediction.affine[mark])
+    size = np.log(candidates.size_px / (scale * layout.radius_mm[mark])) - prediction.log_ratio[mark]
+    like = candidates.is_type.any(axis=1) & (np.abs(size) < np.log(STRANGER_SIZE))
+    return np.asarray(like & (distance < STRANGER_PART * scale * layout.spacing_mm[mark]))
+
+
+def strangers(scene: Scene, prediction: Prediction, match: Index) -> int:
+    """Number of candidates among the predicted marks that look like marks but are none."""
+    like = _look_alikes(scene, prediction)
+    like[match[match >= 0]] = False
+    return int(like.sum())
 
 
 def _extended(scene: Scene, prediction: Prediction, match: Index, damaged: bool) -> Index:
@@ -322,8 +348,8 @@ def _extended(scene: Scene, prediction: Prediction, match: Index, damaged: bool)
     part = DAMAGED_GATE if damaged else 1.0
     difference = candidates.center_px[nearest] - prediction.predicted_px[open_marks]
     in_plane = np.linalg.norm(np.einsum("kij,kj->ki", invert_2x2(prediction.affine[open_marks]), difference), axis=1)
-    size = _root_det(prediction.affine[open_marks]) * layout.radius_mm[open_marks]
-    log_size = np.log(candidates.size_px[nearest] / size) - prediction.log_ratio
+    size = root_det(prediction.affine[open_marks]) * layout.radius_mm[open_marks]
+    log_size = np.log(candidates.size_px[nearest] / size) - prediction.log_ratio[open_marks]
     good = ~taken & fits[nearest, layout.type_index[open_marks]]
     good &= in_plane <= part * limits_mm(scene, prediction, final=damaged)[open_marks]
     good &= np.abs(log_size) <= part * size_limits(layout, prediction)[open_marks]

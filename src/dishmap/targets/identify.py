@@ -16,11 +16,12 @@ from dishmap.camera.model import Camera
 from dishmap.errors import IdentityError
 from dishmap.targets.candidates import Candidates, mark_candidates
 from dishmap.targets.detect import Detections
-from dishmap.targets.growth import Embedding, Scene, fit_pose, grow, is_clean, misfit_of
+from dishmap.targets.ellipses import root_det
+from dishmap.targets.growth import Embedding, Scene, fit_pose, grow, is_clean, misfit_of, strangers
 from dishmap.targets.layout import Layout, layout_of
 from dishmap.targets.pattern import Pattern
 from dishmap.targets.rivals import Observations, Rivals, find_rivals, observe
-from dishmap.targets.search import find_placement, rest_of, scene_of, worth
+from dishmap.targets.search import find_placement, rest_of, scene_of, seen_targets, worth
 from dishmap.transforms import Pose
 
 Array = NDArray[np.float64]
@@ -42,9 +43,14 @@ SAME_PART = 0.5
 # What the hints promise.
 UPRIGHT_RAD = np.radians(45.0)
 GUESS_TURN_RAD, GUESS_SHIFT_MM = np.radians(20.0), 100.0
-# Fewer matched targets, as a part of those that should be seen, are no find; nor is a find with more look-alikes outside it.
-LEAST_SEEN_PART = 0.25
-LEAST_WHOLE_PART = 0.5
+# A find has at least this part of the targets that should be in view, this part of marks with all that is printed in them, not
+# more than this part of look-alikes among its marks that fit nowhere, and circles of the printed size to this part (and px: ink
+# spread and threshold).
+LEAST_SEEN_PART, LEAST_WHOLE_PART, LARGEST_STRANGE_PART = 0.25, 0.5, 0.5
+SIZE_TOLERANCE, SIZE_TOLERANCE_PX = 0.15, 0.7
+# Marks off the places that their neighbours give them, as a part of the spacing, in the median, and more than a bent surface
+# explains: the distances printed are other ones.
+LARGEST_ROUGHNESS, LARGEST_MISFIT = 0.03, 0.01
 LISTED_POSES = 12
 # A placement needs this many marks; a further copy also this part of the first one's.
 FEWEST_MARKS = 4
@@ -125,13 +131,17 @@ def identify(detections: Detections, pattern: Pattern, camera: Camera, hint: Hin
     options: list[_Option] = []
     copies = 0
     least = FEWEST_MARKS
-    while copies < MOST_COPIES:
+    for _ in range(MOST_COPIES):
         placement = find_placement(scene, least)
         if placement is None:
             break
         found = _options(scene, pattern, placement)
-        options += found
-        copies += 1
+        problem = _problem(scene, pattern, found[0].placement)
+        if problem and not options:
+            raise IdentityError(problem)
+        if not problem:
+            options += found
+            copies += 1
         least = max(least, int(np.ceil(COPY_PART * found[0].placement.count)))
         scene = rest_of(scene, found[0].placement)
     if not options:
@@ -141,7 +151,9 @@ def identify(detections: Detections, pattern: Pattern, camera: Camera, hint: Hin
         )
     chosen = _chosen([o for o in options if o.deficit < DECISIVE], hint, pattern, copies)
     final = _settled(chosen)
-    _check_find(chosen.scene, pattern, final)
+    problem = _problem(chosen.scene, pattern, final)
+    if problem:
+        raise IdentityError(problem)
     others = [Alternative(o.pose, o.deficit) for o in options if o is not chosen]
     return _identity(chosen.scene, final, others)
 
@@ -310,31 +322,30 @@ def _settled(chosen: _Option) -> Embedding:
     return chosen.placement if final is None else final
 
 
-def _check_find(scene: Scene, pattern: Pattern, final: Embedding) -> None:
-    """Raise IdentityError when too little of the pattern was found for a find."""
-    layout, candidates = scene.layout, scene.candidates
+def _problem(scene: Scene, pattern: Pattern, final: Embedding) -> str | None:
+    """What is wrong when too little of the pattern was found for a find, or what was found is not as printed."""
+    layout, candidates, prediction = scene.layout, scene.candidates, final.prediction
     marks, used = _pairs(final)
-    if len(marks) < FEWEST_MARKS:
-        raise IdentityError(f"only {len(marks)} marks of the pattern {pattern.name!r} were found, and at least {FEWEST_MARKS} are needed")
-    inside = scene.camera.contains(final.prediction.predicted_px)
-    expected, found = (len(np.unique(layout.target[m])) for m in (np.flatnonzero(inside), marks))
-    if found < LEAST_SEEN_PART * expected:
-        raise IdentityError(
-            f"only {found} of {expected} targets of the pattern {pattern.name!r} that should be in view were found; "
-            "check that it is the printed pattern"
-        )
+    name, advice = f"the pattern {pattern.name!r}", "check that it is the printed pattern"
+    found, expected = seen_targets(scene, final)
+    if len(marks) < FEWEST_MARKS or found < LEAST_SEEN_PART * expected:
+        return (f"only {found} of {expected} targets of {name} that should be in view were found; {advice}")
     whole = candidates.is_type[used, layout.type_index[marks]].mean()
     if whole < LEAST_WHOLE_PART:
-        raise IdentityError(
-            f"the circles found lack what the pattern {pattern.name!r} prints inside them ({100 * (1 - whole):.0f} % of them); "
-            "check that it is the printed pattern"
+        return (f"{100 * (1 - whole):.0f} % of the circles found lack what {name} prints inside them; {advice}")
+    scale = root_det(prediction.affine[marks])
+    ratio = float(np.exp(np.median(prediction.log_ratio[marks])))
+    if abs(np.log(ratio)) > np.log1p(SIZE_TOLERANCE + SIZE_TOLERANCE_PX / np.median(scale * layout.radius_mm[marks])):
+        return (f"circles in the places of {name} are {100 * (ratio - 1):+.0f} % off its size, compared with their distances; {advice}")
+    roughness = float(np.nanmedian(prediction.residual_mm[marks] / layout.spacing_mm[marks]))
+    if roughness > LARGEST_ROUGHNESS and final.misfit_px > LARGEST_MISFIT * np.median(scale * layout.spacing_mm[marks]):
+        return (
+            f"circles are arranged like {name}, but their distances are off by {100 * roughness:.0f} % and more from mark to mark; {advice}"
         )
-    alike = len(observe(scene, final).candidate) - len(marks)
-    if alike > len(marks):
-        raise IdentityError(
-            f"{len(marks)} circles fit the pattern {pattern.name!r}, but {alike} more look like its marks and fit nowhere; "
-            "check that it is the printed pattern, and that only one copy of it is in view"
-        )
+    strange = strangers(scene, prediction, final.candidate)
+    if strange > LARGEST_STRANGE_PART * len(marks):
+        return (f"{len(marks)} circles fit {name}, but {strange} more among them look like its marks and fit nowhere; {advice}")
+    return None
 
 
 def _identity(scene: Scene, final: Embedding, others: list[Alternative]) -> Identity:
@@ -354,14 +365,14 @@ def _reason(scene: Scene, final: Embedding, candidate: int) -> str:
     if not np.isfinite(distance).any():
         return "no mark of the pattern is expected in view"
     nearest = int(np.nanargmin(distance))
-    size = np.sqrt(abs(np.linalg.det(prediction.affine[nearest])))
+    size = float(root_det(prediction.affine[nearest]))
     if distance[nearest] > 0.5 * size * layout.spacing_mm[nearest]:
         return "no mark of the pattern is expected there"
     if final.candidate[nearest] >= 0:
         return "the mark expected there was found beside it"
     if not scene.candidates.is_type[candidate, layout.type_index[nearest]]:
         return "it looks unlike the mark expected there"
-    log_size = np.log(scene.candidates.size_px[candidate] / (size * layout.radius_mm[nearest])) - prediction.log_ratio
+    log_size = np.log(scene.candidates.size_px[candidate] / (size * layout.radius_mm[nearest])) - prediction.log_ratio[nearest]
     if abs(log_size) > np.log(1.2):
         return f"it is {100 * (np.exp(log_size) - 1):+.0f} % off the size of the mark expected there"
     return f"it lies {distance[nearest]:.1f} px from where its neighbours put the mark"

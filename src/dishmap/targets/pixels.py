@@ -2,9 +2,10 @@
 
 Each outermost circle with what is nested in it is one ring here. Its pixels follow
 
-    I(u, v) = ground(u, v) (1 - c) + ink(u, v) c,   c = sum over circles of +-Phi(d / s)
+    I(u, v) = ground(u, v) (1 - c) + ink(u, v) c + bend(u, v),   c = sum over circles of +-Phi(d / s)
 
-with planar ground and ink levels of each ring, d the signed distance to the projected circle and s the total blur
+with planar ground and ink levels of each ring, a quadratic bend of the light over both (glare, shading), d the signed
+distance to the projected circle and s the total blur
 (s^2 = psf^2 + 1/12 for the pixel's own area). A camera's tone curve, level = light^(1 / gamma), bends c (`toned`).
 Curved edges: averaging Phi((d - k t^2 / 2) / s) over the blur along the edge
 (curvature k) shifts the edge by k s^2 / 2 (1 + 3/4 k^2 s^2) and widens it by k^2 s^4 / 2. Where k s is too large for that
@@ -30,8 +31,9 @@ Bool = NDArray[Any]
 # Geometry parameters of a target: 3 moves (mm), 3 turns (rad), edge offset (mm), edge offset (px), blur s (px), log gamma.
 GEOMETRY = 10
 OFFSET_MM, OFFSET_PX, BLUR, TONE = 6, 7, 8, 9
-# Light parameters of a ring: ground level and slopes, ink level and slopes (grey levels, and per local unit).
-LIGHT = 6
+# Light parameters of a ring: ground level and slopes, ink level and slopes, bend (grey levels, in local units).
+LIGHT = 9
+GROUND, INK, BEND = slice(0, 3), slice(3, 6), slice(6, 9)
 # Half width of the band of pixels used, in blurs: beyond it the edge changes the pixel by under 0.2 % of the contrast.
 BAND_BLURS, BAND_EXTRA_PX = 2.5, 0.5
 # Above this product of curvature and blur the series for curved edges leaves more than 0.001 px; see tests.
@@ -80,6 +82,8 @@ class RingPixels:
     ring (M,): which ring of its kind; patches: the area around each ring, with its target; s, t (M, n): coordinates of the
     pixels in the patch; grey (M, n): the photograph; used (M, n): false for padding and pixels left out.
     shape: (H, W) of each ring's full window if the pixels are a whole window (fine rings), else None: blocks of 2x2.
+    saturated (M,): share of the ring's pixels at the end of the scale, which are not used.
+    blocked (M, n): pixels that count as lost to something in front of the print, or None where nothing is.
     """
 
     ring: NDArray[np.int64]
@@ -89,6 +93,8 @@ class RingPixels:
     grey: Single
     used: Bool
     shape: tuple[int, int] | None = None
+    blocked: Bool | None = None
+    saturated: Array | None = None
 
     @property
     def target(self) -> NDArray[np.int64]:
@@ -99,7 +105,8 @@ class RingPixels:
         """The rings `rows` (M,), with targets renumbered by `number`."""
         p = self.patches
         patches = Patches(number[p.target[rows]], p.center_mm[rows], p.reach_mm[rows], p.anchor_px[rows], p.scale_px[rows])
-        return RingPixels(self.ring[rows], patches, self.s[rows], self.t[rows], self.grey[rows], self.used[rows], self.shape)
+        blocked = None if self.blocked is None else self.blocked[rows]
+        return RingPixels(self.ring[rows], patches, self.s[rows], self.t[rows], self.grey[rows], self.used[rows], self.shape, blocked)
 
     def every(self, step: int) -> RingPixels:
         """Keep every `step`-th pixel, for the first coarse steps of a fit (bands only)."""
@@ -294,13 +301,15 @@ def toned(cover: Single, dark_over_light: Single, log_gamma: Single) -> tuple[Si
 
 
 def light_columns(s: Single, t: Single, cover: Single) -> Single:
-    """Derivative of the pixels by the ring's light levels (M, L, n): ground and ink, each level and two slopes."""
+    """Derivative of the pixels by the ring's light levels (M, L, n): ground and ink, each level and two slopes, and the bend."""
     out = np.empty((len(cover), LIGHT, cover.shape[1]), np.float32)
     np.subtract(1, cover, out=out[:, 0])
     out[:, 3] = cover
     for column, place in ((1, s), (2, t)):
         np.multiply(out[:, 0], place, out=out[:, column])
         np.multiply(out[:, 3], place, out=out[:, column + 3])
+    for column, first, second in ((6, s, s), (7, s, t), (8, t, t)):
+        np.multiply(first, second, out=out[:, column])
     return out
 
 
@@ -337,20 +346,21 @@ def _sums(rows: slice, pixels: RingPixels, rings: Rings, maps: LocalMaps, state:
     log_gamma = np.asarray(state.log_gamma[pixels.target[rows], None], np.float32)
     bent, slope, geometry[:, TONE] = toned(np.clip(cover, 0, 1), _dark_over_light(cover, grey, used), log_gamma)
     columns = light_columns(s, t, bent)
-    light, model = _levels(columns, grey, used)
-    robust = used
+    seen = used if pixels.blocked is None else used * ~pixels.blocked[rows]
+    light, model = _levels(columns, grey, seen)
+    robust = seen
     if weighting.cut is not None:
         cut = weighting.cut[rows, None].astype(np.float32)
-        robust = _tapered(grey - model, cut, used)
-        if not np.array_equal(robust, used):
+        robust = _tapered(grey - model, cut, seen)
+        if not np.array_equal(robust, seen):
             # the levels were found with the outliers in; once more without them
             light, model = _levels(columns, grey, robust)
-            robust = _tapered(grey - model, cut, used)
+            robust = _tapered(grey - model, cut, seen)
     residual = grey - model
     variance = np.maximum(np.float32(weighting.base) + np.float32(weighting.slope) * np.maximum(model, 0), TINY)
     weight = robust / variance
     root = np.sqrt(weight)
-    step = (light[:, 3:] - light[:, :3]).astype(np.float32)
+    step = (light[:, INK] - light[:, GROUND]).astype(np.float32)
     contrast = (step[:, :1] + step[:, 1:2] * s + step[:, 2:] * t) * root
     every = np.empty((len(s), GEOMETRY + LIGHT, s.shape[1]), np.float32)
     np.multiply(geometry[:, :TONE], (contrast * slope)[:, None], out=every[:, :TONE])

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from dishmap.camera.model import Camera
 from dishmap.errors import CameraError, ImageError, MeasurementError
@@ -23,7 +24,7 @@ from dishmap.targets.pattern import Pattern
 from dishmap.targets.pixels import GEOMETRY, OFFSET_MM, OFFSET_PX, RingPixels
 from dishmap.targets.scene_noise import NoiseModel, noise_model
 from dishmap.targets.sensitivity import calibration_jacobian, mirror_evidence, mirrored_normals
-from dishmap.targets.stages import Assumptions, Group, Shared, coarse_fit, full_fit, learn, regroup, start_groups
+from dishmap.targets.stages import OCCLUDED_BELOW, Assumptions, Group, Shared, coarse_fit, full_fit, learn, regroup, start_groups
 from dishmap.targets.start import centers_of
 from dishmap.transforms import Pose, angle_between_rad
 
@@ -31,10 +32,14 @@ Array = NDArray[Any]
 Index = NDArray[np.int64]
 
 SMALLEST_RADIUS_PX = 2.0
-# Share of the edge that must be left: below the first the target is flagged, below the second it is not measured.
-OCCLUDED_BELOW, HIDDEN_BELOW = 0.97, 0.5
+# Share of an edge that must be left for a target to be measured.
+HIDDEN_BELOW = 0.5
 # Residual variance over the photograph's noise at which the model is said not to fit, and the least contrast in sigmas.
 POOR_FIT_RATIO, LEAST_CONTRAST_SIGMAS = 2.5, 4.0
+# Pixels over which misfit is coherent (2 sqrt(pi) blurs squared, for a sharp image), and the allowance for a hidden edge.
+COHERENT_PIXELS, OBSTACLE_ALLOWANCE = 9.0, 30.0
+# Share of a ring's pixels at the end of the scale from which glare is said.
+MOST_SATURATED = 0.02
 # Mirrored poses whose chi-square would differ by less than this (3 sigma) cannot be told apart.
 MIRROR_CHI_SQUARE = 9.0
 # Depth leans on the assumed edge offset when knowing the offset would shrink its sigma by more than this.
@@ -97,10 +102,22 @@ def measure_targets(
     MeasurementError if no target can be measured. `progress(done, total)` is called after each group of targets.
     """
     check_image(image, camera)
-    assumptions = assumptions or Assumptions()
+    # thousands of small matrix products: threads would cost more than they bring, far more on a busy machine
+    with threadpool_limits(limits=1, user_api="blas"):
+        return _measure(image, camera, pattern, detections, identity, assumptions or Assumptions(), progress or (lambda done, total: None))
+
+
+def _measure(
+    image: NDArray[Any],
+    camera: Camera,
+    pattern: Pattern,
+    detections: Detections,
+    identity: Identity,
+    assumptions: Assumptions,
+    tell: Callable[[int, int], None],
+) -> TargetPoses:
     groups, rejected = start_groups(camera, pattern, detections, identity, assumptions)
     total = 2 * len(groups)
-    tell = progress or (lambda done, total: None)
     coarse = []
     for group in groups:
         fit = coarse_fit(image, group)
@@ -175,7 +192,8 @@ def _results(image: NDArray[Any], group: Group, adjusted: Adjusted, pixels: Ring
     data = adjusted.data_information / noise.inflation
     prior = adjusted.information - adjusted.data_information
     covariance = inverse_scaled(data + prior)
-    pose_covariance = covariance[:, :6, :6]
+    kept = _kept(adjusted, pixels, count)
+    pose_covariance = covariance[:, :6, :6] * _allowance(adjusted.noise_variance, kept)[:, None, None]
     steps = poses.steps
     turned = np.zeros((count, 6, 6))
     turned[:, :3, :3], turned[:, 3:, 3:] = steps, np.eye(3)
@@ -199,10 +217,20 @@ def _results(image: NDArray[Any], group: Group, adjusted: Adjusted, pixels: Ring
         "offset_mm": adjusted.state.offset_mm,
         "contrast": contrast,
         "noise": sigma,
-        "kept": _kept(adjusted, pixels, count),
+        "kept": kept,
     }
     columns["quality"] = _quality(image, group, adjusted, pixels, columns, data + prior, edge_information)
     return columns
+
+
+def _allowance(misfit: Array, kept: Array) -> Array:
+    """Factor (T,) on covariances for what is no noise: a model that does not fit, or an edge that is partly hidden.
+
+    Misfit is common to the pixels within a blur of each other, where noise is not; what is left beside an obstacle is pulled
+    by its border. Both allowances were set so that flagged targets in simulated clutter keep their claimed sigmas.
+    """
+    poor = np.where(misfit > POOR_FIT_RATIO, COHERENT_PIXELS * (1 - 1 / np.maximum(misfit, 1.0)), 0.0)
+    return np.asarray(1 + poor + np.where(kept < OCCLUDED_BELOW, OBSTACLE_ALLOWANCE * (1 - kept), 0.0))
 
 
 def _kept(adjusted: Adjusted, pixels: RingPixels, count: int) -> Array:
@@ -235,7 +263,7 @@ def _quality(
     flag(adjusted.noise_variance > POOR_FIT_RATIO, Quality.POOR_FIT)
     across = np.linalg.norm(outlines - outlines.mean(axis=2, keepdims=True), axis=3).min(axis=2)
     flag((across < SMALLEST_RADIUS_PX).any(axis=1), Quality.TOO_SMALL)
-    bright, lost = _lost_edges(image, adjusted, pixels, count)
+    bright, lost = _lost_edges(adjusted, pixels, count)
     dropped = np.bincount(pixels.target[~pixels.used.any(axis=1)], minlength=count) > 0
     flag(lost & bright, Quality.GLARE)
     flag((lost & ~bright) | dropped, Quality.OCCLUDED)
@@ -261,7 +289,7 @@ def _ambiguous(group: Group, adjusted: Adjusted, columns: dict[str, Array], edge
     return out
 
 
-def _lost_edges(image: NDArray[Any], adjusted: Adjusted, pixels: RingPixels, count: int) -> tuple[Array, Array]:
+def _lost_edges(adjusted: Adjusted, pixels: RingPixels, count: int) -> tuple[Array, Array]:
     """Whether what is in front of each target is brighter than the model (T,), and whether any edge was lost (T,)."""
     lost = np.zeros(count, bool)
     seen = pixels.used.any(axis=1)
@@ -270,6 +298,7 @@ def _lost_edges(image: NDArray[Any], adjusted: Adjusted, pixels: RingPixels, cou
     highest, lowest = np.zeros(count), np.zeros(count)
     np.maximum.at(highest, pixels.target, extreme.max(axis=1))
     np.minimum.at(lowest, pixels.target, extreme.min(axis=1))
-    full = np.iinfo(image.dtype).max if image.dtype.kind in "ui" else np.inf
-    saturated = by_target(((pixels.grey >= full) & pixels.used).mean(axis=1)[:, None], pixels.target, count)[:, 0] > 0.02
+    saturated = np.zeros(count, bool)
+    if pixels.saturated is not None:
+        np.logical_or.at(saturated, pixels.target, pixels.saturated > MOST_SATURATED)
     return (highest > -lowest) | saturated, lost | saturated

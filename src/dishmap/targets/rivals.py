@@ -11,7 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from dishmap.targets.ellipses import invert_2x2, root_det
 from dishmap.targets.growth import Embedding, Scene, is_clean
 from dishmap.targets.layout import Layout
 from dishmap.targets.markgrid import MarkGrid, meet_surface
@@ -33,6 +35,8 @@ LEAST_EXPLAINED, LEAST_EXPLAINED_ROUGH = 0.3, 0.15
 LEFT_OVER_PART, LEFT_OVER = 0.1, 12
 # A match within this part of its radius, or these px, of where its neighbours put it has the greater weight.
 EXACT_RADIUS, EXACT_PX, EXACT_WEIGHT = 0.1, 0.7, 1.5
+# Candidates within this many spacings of a predicted mark are placed by its local map.
+LOCAL_SPACINGS = 2.5
 # Sizes that differ by less than this (log) could be the same circle.
 SAME_LOG_SIZE = 0.2
 
@@ -90,18 +94,34 @@ def observe(scene: Scene, placement: Embedding) -> Observations:
 
 
 def _on_surface(scene: Scene, placement: Embedding, index: Index) -> tuple[Array, Array]:
-    """Where rays of candidates meet the nominal surface (n, 3), NaN if nowhere, and the printed radius they would have there."""
+    """Where candidates lie in the dish frame (n, 3), NaN if nowhere, and the printed radius (n,) they would have there.
+
+    Near a mark that is predicted from its neighbours, by the map of its own plane, which a bent surface does not disturb;
+    elsewhere where the ray meets the nominal surface.
+    """
+    layout, candidates, prediction = scene.layout, scene.candidates, placement.prediction
     dish_from_camera = placement.fit.pose.inverse()
     origin = dish_from_camera.translation_mm
-    ray = dish_from_camera.rotate(scene.candidates.ray[index])
-    t = meet_surface(scene.layout.surface, origin, ray)
+    ray = dish_from_camera.rotate(candidates.ray[index])
+    t = meet_surface(layout.surface, origin, ray)
     place = origin + t[:, None] * ray
+    known = np.flatnonzero(prediction.known)
+    log_ratio = np.full(len(index), np.median(prediction.log_ratio))
     with np.errstate(invalid="ignore", divide="ignore"):
-        normal = scene.layout.surface.normal(place[:, :2])
-        facing = np.abs((normal * ray).sum(axis=1))
+        facing = np.abs((layout.surface.normal(place[:, :2]) * ray).sum(axis=1))
         # a small circle's image shrinks with distance, and with the root of its foreshortening in mean radius
-        radius = np.sqrt(np.abs(np.linalg.det(scene.candidates.shape[index]))) * t / np.sqrt(facing)
-    return place, radius / np.exp(placement.prediction.log_ratio)
+        radius = root_det(candidates.shape[index]) * t / np.sqrt(facing)
+    if len(known) and len(index):
+        _, nearest = cKDTree(prediction.predicted_px[known]).query(candidates.center_px[index])
+        mark = known[nearest]
+        away = candidates.center_px[index] - prediction.predicted_px[mark]
+        in_plane = (invert_2x2(prediction.affine[mark]) @ away[:, :, None])[..., 0]
+        near = np.linalg.norm(in_plane, axis=1) < LOCAL_SPACINGS * layout.spacing_mm[mark]
+        local = layout.center_mm[mark] + (layout.axes[mark][:, :, :2] @ in_plane[:, :, None])[..., 0]
+        place = np.where(near[:, None], local, place)
+        radius = np.where(near, candidates.size_px[index] / root_det(prediction.affine[mark]), radius)
+        log_ratio = np.where(near, prediction.log_ratio[mark], log_ratio)
+    return place, radius / np.exp(log_ratio)
 
 
 def find_rivals(scene: Scene, placement: Embedding, seen: Observations) -> Rivals:
@@ -133,7 +153,7 @@ def find_rivals(scene: Scene, placement: Embedding, seen: Observations) -> Rival
 def _weights(placement: Embedding, layout: Layout, seen: Observations) -> Array:
     """Weight (n,) of each observation: more for matches so close to their place that no stray circle lies there by chance."""
     residual = np.where(seen.mark >= 0, placement.prediction.residual_mm[seen.mark], np.inf)
-    scale = np.sqrt(np.abs(np.linalg.det(np.nan_to_num(placement.prediction.affine[seen.mark]))))
+    scale = root_det(np.nan_to_num(placement.prediction.affine[seen.mark]))
     limit = np.maximum(EXACT_RADIUS * layout.radius_mm[seen.mark], EXACT_PX / np.maximum(scale, 1e-9))
     with np.errstate(invalid="ignore"):
         return np.where(residual < limit, EXACT_WEIGHT, 1.0)

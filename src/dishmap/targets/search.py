@@ -14,6 +14,7 @@ from dishmap.camera.model import Camera
 from dishmap.targets.beam import sort_out
 from dishmap.targets.candidates import Candidates
 from dishmap.targets.constellations import NEAREST_IN_IMAGE, Hypotheses, match_neighbourhood
+from dishmap.targets.ellipses import root_det
 from dishmap.targets.growth import Embedding, Scene, grow, is_clean
 from dishmap.targets.layout import Layout
 from dishmap.targets.markgrid import MarkGrid
@@ -29,7 +30,7 @@ FIRST_SEEDS, CLEAR_VOTES = 3, 6
 FEWEST_SORTED = 12
 # Hypotheses agree about as well as the best when their misfit is below this many times the best one plus this much.
 CLEAR_MISFIT = (4.0, 0.002)
-MOST_GROWN = 36
+MOST_GROWN = 15
 # A clean placement that takes in this part of all candidates, or of the pattern's marks, ends the search.
 ENOUGH = 0.5
 # A placement that is not clean may be a wrong one, bent to fit: it ends the search only when so many were found.
@@ -37,7 +38,9 @@ ENOUGH_BENT = 3
 ABOUT_EQUAL = 3
 # A start is grown when it explains this part of what is asked for, before any bending is allowed for.
 RIGID_COUNT_PART = 0.4
-# A placement is no find when circles strewn at random would give one as good more often than this.
+# A first placement takes in at least this part of the targets that should be in view (its rivals may take in more), and
+# it is no find when circles strewn at random would give one as good more often than this.
+LEAST_FIRST_PART = 0.12
 LARGEST_LOG10_CHANCE = -3.0
 SMALLEST_REACH_PX, TURNS_TRIED = 0.5, 8
 
@@ -66,7 +69,7 @@ def find_placement(scene: Scene, least: int) -> Embedding | None:
                 continue
             placement = grow(scene, start.pose, start.marks, start.candidates)
             grown += 1
-            if placement is None or placement.count < least or log10_chance(scene, placement) > LARGEST_LOG10_CHANCE:
+            if placement is None or placement.count < least or not _is_credible(scene, placement):
                 continue
             if best is None or worth(placement) > worth(best):
                 best = placement
@@ -77,6 +80,18 @@ def find_placement(scene: Scene, least: int) -> Embedding | None:
         if grown >= MOST_GROWN or enough >= ENOUGH_BENT:
             break
     return best
+
+
+def seen_targets(scene: Scene, placement: Embedding) -> tuple[int, int]:
+    """Number of targets with a match, and of targets that should be in view."""
+    found = placement.candidate >= 0
+    expected = scene.camera.contains(placement.prediction.predicted_px) | found
+    return len(np.unique(scene.layout.target[found])), len(np.unique(scene.layout.target[expected]))
+
+
+def _is_credible(scene: Scene, placement: Embedding) -> bool:
+    found, expected = seen_targets(scene, placement)
+    return found >= LEAST_FIRST_PART * expected and log10_chance(scene, placement) <= LARGEST_LOG10_CHANCE
 
 
 def log10_chance(scene: Scene, placement: Embedding) -> float:
@@ -94,7 +109,7 @@ def log10_chance(scene: Scene, placement: Embedding) -> float:
     center = scene.candidates.center_px[scene.candidates.is_type.any(axis=1)]
     near = int(((center >= low - 1) & (center <= high + 1)).all(axis=1).sum())
     # the residual in px: that in mm times the scale of the map
-    scale = np.sqrt(np.abs(np.linalg.det(placement.prediction.affine[marks])))
+    scale = root_det(placement.prediction.affine[marks])
     reach = max(float((np.nan_to_num(placement.prediction.residual_mm[marks]) * scale).max()), SMALLEST_REACH_PX)
     p = min(0.5, np.pi * reach**2 * max(near, 1) / float(np.prod(np.maximum(high - low, 1.0))))
     choices = (math.lgamma(m + 1) - math.lgamma(n + 1) - math.lgamma(m - n + 1)) / math.log(10)

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from dishmap.camera.model import Camera
-from dishmap.targets.adjust import Adjusted, Batch, Priors, adjust, by_target, inverse_scaled, with_other_priors
+from dishmap.targets.adjust import Adjusted, Batch, Priors, adjust, by_target, inverse_scaled, with_other_priors, with_rest
 from dishmap.targets.detect import Detections
 from dishmap.targets.edges import Poses
 from dishmap.targets.identify import Identity
@@ -40,6 +41,11 @@ GROUP_SIZE = 96
 CUT_SIGMAS, CUT_CONTRAST = 8.0, 0.1
 # A ring of which less than this share of an edge survives is left out, when the target has others.
 LEAST_KEPT = 0.7
+LEAST_CONTRAST_SHARE = 0.5
+# Share of an edge below which something is in front of it, and how far from the lost pixels its border reaches, in blurs.
+OCCLUDED_BELOW, OBSTACLE_BLURS = 0.97, 2.0
+# A ring's cut may exceed the picture's usual one, relative to contrast, by this factor.
+WIDEST_CUT = 1.5
 # A normal that the pixels pull farther than this from the surface, in sigmas of the prior, is left to the pixels.
 STRAY_SIGMAS = 4.0
 LEAST_NORMAL_SIGMA_RAD = np.radians(0.02)
@@ -86,13 +92,18 @@ class Coarse:
 
 @dataclass(frozen=True)
 class Shared:
-    """What all targets of the photograph share: rigid pose, noise, spread of normals, tone curve (log gamma and its sigma)."""
+    """What all targets of the photograph share.
+
+    camera_from_dish: rigid pose of the pattern; noise; normal_sigma_rad: spread of normals about the pattern's surface;
+    log_gamma of the tone curve and its sigma; cut_share: usual cut of a ring's residuals over its contrast.
+    """
 
     camera_from_dish: Pose
     noise: NoiseModel
     normal_sigma_rad: float
     log_gamma: float
     log_gamma_sigma: float
+    cut_share: float
 
 
 def start_groups(
@@ -204,8 +215,7 @@ def residual_cut(adjusted: Adjusted, pixels: RingPixels) -> Array:
     absolute = np.where(pixels.used, np.abs(adjusted.residual), np.nan)
     with np.errstate(all="ignore"):
         sigma = ROBUST_TO_SIGMA * np.nan_to_num(_nan_median(absolute), nan=1.0)
-    contrast = np.abs(adjusted.sums.light[:, 0] - adjusted.sums.light[:, 3])
-    return np.maximum(np.maximum(CUT_SIGMAS * sigma, CUT_CONTRAST * contrast), 1.0)
+    return np.maximum(np.maximum(CUT_SIGMAS * sigma, CUT_CONTRAST * np.abs(ring_contrast(adjusted))), 1.0)
 
 
 def _nan_median(values: Array) -> Array:
@@ -224,12 +234,13 @@ def learn(camera: Camera, pattern: Pattern, start: Pose, coarse: list[Coarse], a
     noise = noise_model(
         [c.pixels.grey for c in coarse], [c.adjusted.residual for c in coarse], [c.pixels.used for c in coarse], [False] * len(coarse)
     )
-    tone = shared_tone(coarse)
+    shares = np.concatenate([c.cut / np.maximum(ring_contrast(c.adjusted), 1.0) for c in coarse])
+    rest = (*shared_tone(coarse), float(np.median(shares)))
     if assumptions.normal_sigma_deg is not None:
-        return Shared(pose, noise, max(np.radians(assumptions.normal_sigma_deg), LEAST_NORMAL_SIGMA_RAD), *tone)
+        return Shared(pose, noise, max(np.radians(assumptions.normal_sigma_deg), LEAST_NORMAL_SIGMA_RAD), *rest)
     tilt, covariance = zip(*(free_tilt(c, pose.rotation @ pattern.normal[c.group.index].T) for c in coarse), strict=True)
     settled = np.concatenate([c.adjusted.converged for c in coarse])
-    return Shared(pose, noise, normal_spread(np.concatenate(tilt)[settled], np.concatenate(covariance)[settled]), *tone)
+    return Shared(pose, noise, normal_spread(np.concatenate(tilt)[settled], np.concatenate(covariance)[settled]), *rest)
 
 
 def shared_tone(coarse: list[Coarse]) -> tuple[float, float]:
@@ -294,7 +305,7 @@ def full_fit(image: NDArray[Any], pattern: Pattern, coarse: Coarse, shared: Shar
     group = replace(group, poses=poses, state=state, batch=replace(group.batch, priors=priors))
     widest = float(np.quantile(group.state.blur_px, 0.9))
     batch, pixels = layout(image, group, widest, widest)
-    cut, pixels = _without_bad_rings(coarse, pixels)
+    cut, pixels = _without_bad_rings(coarse, pixels, shared)
     weighting = Weighting(shared.noise.base, shared.noise.slope, cut)
     adjusted = adjust(batch, pixels, group.poses, group.state, weighting, FULL_STEPS)
     strays = angle_between_rad(adjusted.poses.rotation[..., 2], expected) > STRAY_SIGMAS * shared.normal_sigma_rad
@@ -302,16 +313,46 @@ def full_fit(image: NDArray[Any], pattern: Pattern, coarse: Coarse, shared: Shar
         sigma = np.where(strays, FIRST_NORMAL_SIGMA_RAD, shared.normal_sigma_rad)
         batch = replace(batch, priors=replace(priors, normal_sigma_rad=sigma))
         adjusted = adjust(batch, pixels, adjusted.poses, adjusted.state, weighting, FULL_STEPS)
+    adjusted, pixels = _clear_of_obstacles(batch, pixels, adjusted, weighting)
     return replace(group, batch=batch, poses=adjusted.poses, state=adjusted.state), adjusted, pixels
 
 
-def _without_bad_rings(coarse: Coarse, pixels: RingPixels) -> tuple[Array, RingPixels]:
+def _clear_of_obstacles(batch: Batch, pixels: RingPixels, fit: Adjusted, weighting: Weighting) -> tuple[Adjusted, RingPixels]:
+    """Fit targets that lost part of an edge once more, without the pixels beside the lost ones.
+
+    At the border of whatever is in front, pixels are a mixture that passes for noise but pulls on the edge.
+    """
+    assert weighting.cut is not None
+    lost = (np.abs(fit.residual) > weighting.cut[:, None]) & pixels.used
+    rows = np.flatnonzero((fit.sums.kept.min(axis=1) < OCCLUDED_BELOW) & lost.any(axis=1))
+    if not len(rows):
+        return fit, pixels
+    blocked = np.zeros_like(pixels.used)
+    for row in rows:
+        place = np.stack([pixels.s[row], pixels.t[row]], axis=1) * pixels.patches.scale_px[row]
+        far, _ = cKDTree(place[lost[row]]).query(place)
+        blocked[row] = far < OBSTACLE_BLURS * fit.state.blur_px[pixels.target[row]] + 1.0
+    pixels = replace(pixels, blocked=blocked)
+    again = np.zeros(len(fit.poses), bool)
+    again[pixels.target[rows]] = True
+    return with_rest(batch, pixels, replace(fit, converged=fit.converged & ~again), weighting, FULL_STEPS), pixels
+
+
+def _without_bad_rings(coarse: Coarse, pixels: RingPixels, shared: Shared) -> tuple[Array, RingPixels]:
     """Cuts (M,) for the pixels' rings, and the pixels without rings of which little can be seen."""
-    per_target = by_target(coarse.cut[:, None], coarse.pixels.target, len(coarse.group.poses))[:, 0]
-    number = np.bincount(coarse.pixels.target, minlength=len(per_target))
-    if len(pixels.ring) != len(coarse.pixels.ring):
-        return (per_target / number)[pixels.target], pixels
-    bad = coarse.adjusted.sums.kept.min(axis=1) < LEAST_KEPT
-    good = np.bincount(pixels.target, weights=~bad, minlength=len(per_target))
-    drop = bad & (good[pixels.target] > 0)
-    return coarse.cut, replace(pixels, used=pixels.used & ~drop[:, None])
+    count, target = len(coarse.group.poses), coarse.pixels.target
+    contrast = ring_contrast(coarse.adjusted)
+    usual = by_target(contrast[:, None], target, count)[:, 0] / np.maximum(np.bincount(target, minlength=count), 1)
+    # something in front of a ring widens its own residuals: no ring may differ much more than the picture's rings do
+    cut = np.minimum(coarse.cut, np.maximum(WIDEST_CUT * shared.cut_share * usual[target], CUT_SIGMAS * np.sqrt(shared.noise.base)))
+    if len(pixels.ring) != len(target):
+        return by_target(cut[:, None], target, count)[pixels.target, 0] / np.bincount(target, minlength=count)[pixels.target], pixels
+    bad = (coarse.adjusted.sums.kept.min(axis=1) < LEAST_KEPT) | (contrast < LEAST_CONTRAST_SHARE * usual[target])
+    good = np.bincount(target, weights=~bad, minlength=count)
+    drop = bad & (good[target] > 0)
+    return cut, replace(pixels, used=pixels.used & ~drop[:, None])
+
+
+def ring_contrast(adjusted: Adjusted) -> Array:
+    """Ground minus ink level (M,) of each ring, grey levels."""
+    return np.asarray(adjusted.sums.light[:, 0] - adjusted.sums.light[:, 3])

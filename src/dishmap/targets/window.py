@@ -93,11 +93,14 @@ def ring_pixels(
     return _bands(image, rings, maps, patches, ring, half, reach)
 
 
-def _gather(image: NDArray[Any], u: Index, v: Index) -> tuple[NDArray[Any], NDArray[Any]]:
+def _gather(image: NDArray[Any], u: Index, v: Index) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Grey levels, whether inside the image, and whether at the end of the scale."""
     height, width = image.shape
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     flat = np.clip(v, 0, height - 1) * width + np.clip(u, 0, width - 1)
-    return np.take(image.reshape(-1), flat).astype(np.float32), inside
+    grey = np.take(image.reshape(-1), flat)
+    full = np.iinfo(image.dtype).max if image.dtype.kind in "ui" else np.inf
+    return grey.astype(np.float32), inside, grey >= full
 
 
 def _whole_windows(
@@ -106,11 +109,12 @@ def _whole_windows(
     side = 2 * half + 1
     dv, du = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1)
     anchor = patches.anchor_px.astype(int)
-    grey, inside = _gather(image, anchor[:, :1] + du, anchor[:, 1:] + dv)
+    grey, inside, full = _gather(image, anchor[:, :1] + du, anchor[:, 1:] + dv)
     scale = patches.scale_px[:, None]
     s, t = (du / scale).astype(np.float32), (dv / scale).astype(np.float32)
     # a window may reach into the next target: only pixels near this one's edges count
-    return RingPixels(ring, patches, s, t, grey, inside & _near_edges(rings, maps, ring, s, t, reach), (side, side))
+    near = inside & _near_edges(rings, maps, ring, s, t, reach)
+    return RingPixels(ring, patches, s, t, grey, near & ~full, (side, side), saturated=_share(near & full, near))
 
 
 def _bands(image: NDArray[Any], rings: Rings, maps: LocalMaps, patches: Patches, ring: Index, half: Array, reach: float) -> RingPixels:
@@ -132,8 +136,13 @@ def _bands(image: NDArray[Any], rings: Rings, maps: LocalMaps, patches: Patches,
         out_v.reshape(-1)[first + k] = dv[block] + stride * (k // 2)
         used.reshape(-1)[first + k] = True
     anchor = patches.anchor_px.astype(np.int32)
-    grey, inside = _gather(image, anchor[:, :1] + out_u, anchor[:, 1:] + out_v)
-    return RingPixels(ring, patches, out_u.astype(np.float32) / scale, out_v.astype(np.float32) / scale, grey, used & inside)
+    grey, inside, full = _gather(image, anchor[:, :1] + out_u, anchor[:, 1:] + out_v)
+    s, t = out_u.astype(np.float32) / scale, out_v.astype(np.float32) / scale
+    return RingPixels(ring, patches, s, t, grey, used & inside & ~full, saturated=_share(used & full, used))
+
+
+def _share(some: NDArray[Any], of: NDArray[Any]) -> Array:
+    return np.asarray(some.sum(axis=1) / np.maximum(of.sum(axis=1), 1))
 
 
 def _near_edges(rings: Rings, maps: LocalMaps, ring: Index, s: NDArray[Any], t: NDArray[Any], reach_px: float) -> NDArray[Any]:
