@@ -99,6 +99,17 @@ def errors_of(result: Map, truth: Truth) -> Errors:
     )
 
 
+def nothing() -> Errors:
+    """Errors of no target."""
+    none = np.zeros(0)
+    flags = np.zeros(0, np.int64)
+    return Errors(flags, np.zeros((0, 3)), np.zeros((0, 2)), none, np.zeros((0, 3)), np.zeros((0, 2)), none, flags)
+
+
+def select(errors: Errors, keep: NDArray[np.bool_]) -> Errors:
+    return Errors(*(getattr(errors, name)[keep] for name in Errors.__dataclass_fields__))
+
+
 def join(parts: Sequence[Errors]) -> Errors:
     return Errors(*(np.concatenate([getattr(part, name) for part in parts]) for name in Errors.__dataclass_fields__))
 

@@ -15,9 +15,10 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from _common import QUICK, Array, Errors, covered, errors_of, print_table, rms, wrong_names
+from _common import QUICK, Array, Errors, covered, errors_of, nothing, print_table, rms, wrong_names
 
 from dishmap.camera.model import Camera
 from dishmap.errors import DishmapError
@@ -108,9 +109,8 @@ def photograph(cell: Cell, rng: np.random.Generator) -> tuple[Scene, Pose]:
     shift = rng.uniform(-0.5, 0.5, 3) * DISTANCE_MM / FOCAL_PX * 4
     pose = Pose(facing @ tilt @ spin, DISTANCE_MM * ray + shift)
     light = Light(ink_grey=INK_GREY, ground_grey=GROUND_GREY, background_grey=GROUND_GREY)
-    scene = Scene(
-        pattern, camera, pose, light=light, sensor=Sensor(psf_sigma_px=cell.blur_px, noise_grey=(GROUND_GREY - INK_GREY) / cell.contrast)
-    )
+    sensor = Sensor(psf_sigma_px=cell.blur_px, noise_grey=(GROUND_GREY - INK_GREY) / cell.contrast)
+    scene = Scene(pattern, camera, pose, light=light, sensor=sensor)
     turn = rotation_from_vector(np.radians(GUESS_DEG) * _unit(rng))
     return scene, Pose(turn @ pose.rotation, pose.translation_mm + GUESS_MM * _unit(rng))
 
@@ -132,7 +132,9 @@ def run(cell: Cell, targets: int, seed: int) -> list[Outcome]:
         try:
             result = map_photograph(picture.image, scene.camera, scene.pattern, PoseGuess(guess))
         except DishmapError as error:
-            print(f"not mapped: {cell}: {error}")
+            print(f"refused: {cell}: {str(error)[:120]}")
+            none = np.zeros(0)
+            outcomes.append(Outcome(cell, nothing(), np.zeros((0, 2)), none, none, len(scene.pattern), 0))
             continue
         index = np.searchsorted(scene.pattern.ids, result.cloud.ids)
         poses = _true_poses(scene, picture.truth, index)
@@ -190,6 +192,8 @@ def row_of(outcomes: list[Outcome]) -> tuple[object, ...]:
     z = np.concatenate([o.errors.position_mm[:, 2] / o.bound_depth_mm for o in outcomes])
     scores = np.concatenate([o.errors.scores for o in outcomes])
     asked = sum(o.asked for o in outcomes)
+    if not len(z):
+        return (asked, 0, 0, *[""] * (len(HEADER) - 3))
     efficiency = 1 / np.mean(uv**2)
     normal = np.concatenate([o.errors.normal_rad for o in outcomes])
     return (
@@ -212,10 +216,9 @@ def row_of(outcomes: list[Outcome]) -> tuple[object, ...]:
     )
 
 
-def show(title: str, outcomes: list[Outcome], key: Callable[[Cell], object]) -> None:
-    rows = []
-    for value in dict.fromkeys(key(o.cell) for o in outcomes):
-        rows.append((value, *row_of([o for o in outcomes if key(o.cell) == value])))
+def show(title: str, outcomes: list[Outcome], key: Callable[[Cell], Any]) -> None:
+    values = sorted({key(o.cell) for o in outcomes})
+    rows = [(value, *row_of([o for o in outcomes if key(o.cell) == value])) for value in values]
     print_table((title, *HEADER), rows, f"by {title}")
 
 
@@ -252,8 +255,10 @@ def worst(outcomes: list[Outcome]) -> None:
     """The cells whose efficiency is lowest beyond what chance explains, those with the largest bias and depth ratio."""
     rows = {}
     for cell in dict.fromkeys(o.cell for o in outcomes):
-        rows[cell] = row_of([o for o in outcomes if o.cell == cell])
-    named = (
+        row = row_of([o for o in outcomes if o.cell == cell])
+        if row[1]:
+            rows[cell] = row
+    named: tuple[tuple[str, Callable[[Any], float]], ...] = (
         ("centre efficiency", lambda r: r[5] + 2 * r[6]),
         ("depth error over bound", lambda r: -r[9]),
         ("bias of depth", lambda r: -abs(r[11])),

@@ -13,12 +13,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from _common import QUICK, Errors, covered, errors_of, join, print_table, rms, wrong_names
+from _common import QUICK, Errors, covered, errors_of, join, nothing, print_table, rms, select, wrong_names
 
 from dishmap.camera.model import Camera
 from dishmap.errors import DishmapError
 from dishmap.pipeline import map_photograph
 from dishmap.quality import Quality
+from dishmap.simulate.deform import Deformation, ZernikeTerm
 from dishmap.simulate.render import simulate
 from dishmap.simulate.scene import Light, Scene, Sensor, facing_pose
 from dishmap.targets.builders import concentric, dish, multi_circular, plate, ring, whycon
@@ -26,9 +27,10 @@ from dishmap.targets.identify import Upright
 from dishmap.targets.pattern import Pattern, TargetKind
 from dishmap.transforms import Pose
 
-SEEDS = 10 if QUICK else 100
+SEEDS = 12 if QUICK else 120
 SIZE_PX = (1000, 800)
 RADIUS_PX = (6.0, 22.0)
+MOST_ACROSS = 8
 KINDS: dict[str, Callable[[float], TargetKind]] = {
     "four rings": lambda r: multi_circular(4, r, 0.6 * r, 2.8 * r),
     "ring": lambda r: ring(r, 0.6 * r),
@@ -65,12 +67,20 @@ def draw_camera(rng: np.random.Generator) -> tuple[Camera, str]:
 
 
 def draw_pattern(kind: TargetKind, width_mm: float, rng: np.random.Generator) -> tuple[Pattern, str]:
-    """A plate or a dish that fills about this width."""
-    pitch = 2.3 * kind.extent_mm
-    count = max(3, int(width_mm / pitch))
-    if rng.random() < 0.5:
-        return plate(max(3, int(0.75 * count)), count, pitch, kind), "plate"
-    return dish(count * pitch, 0.6 * count * pitch, spacing_mm=1.15 * pitch, kind=kind, center_target=True), "dish"
+    """A plate, a plate to be bent, or a dish, of up to this width and MOST_ACROSS targets across."""
+    pitch = rng.uniform(2.2, 2.8) * kind.extent_mm
+    count = int(np.clip(width_mm / pitch, 3, MOST_ACROSS))
+    surface = str(rng.choice(["plate", "bent plate", "dish"]))
+    if surface == "dish":
+        return dish(count * pitch, 0.6 * count * pitch, spacing_mm=1.15 * pitch, kind=kind), surface
+    return plate(max(3, int(0.75 * count)), count, pitch, kind), surface
+
+
+def bend(pattern: Pattern, rng: np.random.Generator) -> Deformation:
+    """A plate bent by up to 0.3 degrees: more would stretch it, and its targets, by slope^2 / 2, which no sigma knows of."""
+    slope = np.radians(rng.uniform(0.05, 0.3))
+    reach = float(np.linalg.norm(pattern.center_mm, axis=1).max())
+    return Deformation(zernike=(ZernikeTerm(2, 2, 0.5 * slope * reach), ZernikeTerm(3, -1, 0.1 * slope * reach)))
 
 
 def photograph(rng: np.random.Generator) -> tuple[Scene, Shot]:
@@ -88,12 +98,9 @@ def photograph(rng: np.random.Generator) -> tuple[Scene, Shot]:
     # shot noise is as large at the ground's level as the noise of a photograph without it
     electrons = ground / noise**2 if shot_noise else None
     sensor = Sensor(rng.uniform(0.5, 1.6), 1.0, 0.3 * noise if shot_noise else noise, electrons, bits)
-    return Scene(pattern, camera, pose, light=light, sensor=sensor), Shot(name, lens, bits, shot_noise, surface, _nothing())
-
-
-def _nothing() -> Errors:
-    empty = np.zeros(0)
-    return Errors(empty, np.zeros((0, 3)), np.zeros((0, 2)), empty, np.zeros((0, 3)), np.zeros((0, 2)), empty, np.zeros(0, np.int64))
+    deformation = bend(pattern, rng) if surface == "bent plate" else Deformation()
+    scene = Scene(pattern, camera, pose, deformation, light, sensor)
+    return scene, Shot(name, lens, bits, shot_noise, surface, nothing())
 
 
 def row_of(errors: Errors) -> tuple[object, ...]:
@@ -110,10 +117,6 @@ def row_of(errors: Errors) -> tuple[object, ...]:
         rms(np.degrees(errors.sigma_normal_rad)),
         rms(errors.normal_rad / errors.sigma_normal_rad),
     )
-
-
-def select(errors: Errors, keep: np.ndarray) -> Errors:
-    return Errors(*(getattr(errors, name)[keep] for name in Errors.__dataclass_fields__))
 
 
 def main() -> None:
@@ -136,15 +139,13 @@ def main() -> None:
         shots.append(Shot(drawn.kind, drawn.lens, drawn.bits, drawn.shot_noise, drawn.surface, errors_of(result, picture.truth)))
         _tell_outliers(seed, shots[-1])
     every = join([s.errors for s in shots])
-    print(
-        f"{SEEDS} photographs, {asked} targets wholly in view, {len(every)} measured, {refused} in refused photographs, {wrong} wrong names"
-    )
+    print(f"{SEEDS} photographs, {asked} targets wholly in view, {len(every)} measured, {wrong} wrong names")
+    print(f"{refused} targets in photographs that were refused")
     header = ("targets", "+-", "x %", "y %", "z %", "u %", "v %", "rms z/s", "rms u/s", "bias z/s", "bias uv/s")
     header = ("of", *header, "normal deg", "claimed", "rms n/s")
     rows = [("all", *row_of(every)), ("no flag", *row_of(select(every, every.quality == 0)))]
-    rows += [
-        (str(f.name).lower(), *row_of(select(every, (every.quality & f) > 0))) for f in Quality if f and ((every.quality & f) > 0).any()
-    ]
+    flagged = {str(flag.name).lower(): (every.quality & flag) > 0 for flag in Quality if flag}
+    rows += [(name, *row_of(select(every, has))) for name, has in flagged.items() if has.any()]
     for name in ("kind", "lens", "surface", "bits", "shot_noise"):
         for value in sorted({getattr(s, name) for s in shots}):
             rows.append((f"{name} {value}", *row_of(join([s.errors for s in shots if getattr(s, name) == value]))))

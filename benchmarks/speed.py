@@ -84,7 +84,7 @@ def _status_mb(name: str) -> float:
 
 
 def import_seconds(what: str) -> tuple[float, float]:
-    code = f"import time; t, p = time.perf_counter(), time.process_time(); import {what}; print(time.perf_counter() - t, time.process_time() - p)"
+    code = f"from time import perf_counter as t, process_time as p; a, b = t(), p(); import {what}; print(t() - a, p() - b)"
     runs = [subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split() for _ in range(REPEATS)]
     return statistics.median(float(run[0]) for run in runs), statistics.median(float(run[1]) for run in runs)
 

@@ -19,9 +19,8 @@ from dishmap.page import script_json
 from dishmap.pipeline import Map, map_photograph
 from dishmap.quality import Quality
 from dishmap.report import calibration_report, map_report
-from dishmap.simulate.deform import Bump, Deformation
 from dishmap.simulate.render import simulate
-from dishmap.simulate.scene import Disc, Light, Scene, Sensor, facing_pose
+from dishmap.simulate.scene import Disc, Scene, Sensor, facing_pose
 from dishmap.surface.cloud import select_points
 from dishmap.targets.builders import dish, plate
 from dishmap.targets.identify import Upright
@@ -110,11 +109,10 @@ def flat() -> Shot:
 
 @pytest.fixture(scope="module")
 def hidden() -> Shot:
-    """A plate with one target covered and one beside the others by a bump."""
+    """A plate with one target covered; the camera has no covariance."""
     u, v = CAMERA.project(PLATE_POSE.apply([[*COVERED_MM, 0.0]]))[0]
-    bump = Deformation(bumps=(Bump((25.0, 0.0), 8.0, 3.0),))
     camera = Camera(640, 480, [800.0, 800.0], [319.5, 239.5])
-    scene = Scene(plate(3, 4, 50), camera, PLATE_POSE, bump, Light(), Sensor(noise_grey=1.5), occluders=(Disc((u, v), 32.0, 90.0),))
+    scene = Scene(plate(3, 4, 50), camera, PLATE_POSE, sensor=Sensor(noise_grey=1.5), occluders=(Disc((u, v), 32.0, 90.0),))
     return shot_of(scene)
 
 
@@ -245,11 +243,14 @@ def test_what_is_missing_or_strange_is_told(hidden: Shot) -> None:
     at = result.pattern.center_mm[:, :2]
     covered = int(result.pattern.ids[np.argmin(np.linalg.norm(at - COVERED_MM, axis=1))])
     assert set(result.missing) | {i for i, _ in result.rejected if i is not None} == {covered}
-    assert ((result.cloud.quality & int(Quality.OFF_SURFACE)) != 0).any()
+    strange = np.where(result.cloud.ids == result.cloud.ids[5], int(Quality.OFF_SURFACE | Quality.GLARE), 0)
+    result = replace(result, cloud=replace(result.cloud, quality=strange))
     html = map_report(result, hidden.image, "hidden", {})
     said = words(html)
     assert "11 of 12 targets measured; 1 " in said
-    assert "flagged off_surface" in said
+    assert f"1 target flagged off_surface ({result.cloud.ids[5]}): the target lies far from the surface" in said
+    assert f"1 target flagged glare ({result.cloud.ids[5]}): " in said
+    assert "10 of 11 targets measured are clean" in said
     assert "covariance is unknown" in said
     assert "Not known: the camera file carries no covariance." in said
 

@@ -124,8 +124,8 @@ def ratio_histogram(ratio: Array, spread: float) -> Figure:
         highest = max(highest, float(_normal_curve(np.zeros(1), spread)[0]))
     else:
         highest = max(highest, 0.4)
-    axes.set(xlabel="residual / claimed sigma", ylabel="share of targets per unit", xlim=(-reach, reach), ylim=(0.0, 1.35 * highest))
-    axes.legend(loc="upper left")
+    axes.set(xlabel="residual / claimed sigma", ylabel="share of targets per unit", xlim=(-reach, reach), ylim=(0.0, 1.08 * highest))
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderpad=0.0)
     return figure
 
 

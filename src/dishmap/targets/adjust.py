@@ -38,8 +38,8 @@ LARGEST_TURN_RAD = 0.2
 NEW_FIELDS_RAD = 0.01
 SHARPEST_BLUR_PX, WIDEST_BLUR_PX = 0.3, 12.0
 STRONGEST_LOG_GAMMA = 1.2
-# Converged when the next step would be under 6 % of the estimate's own sigma, or the step itself is under 2e-4 px.
-STEP_SIGMAS, STEP_PX, SETTLED_PX = 0.06, 2e-4, 0.3
+# Converged when the next step would be under 4 % of the estimate's own sigma, or the step itself is under 2e-4 px.
+STEP_SIGMAS, STEP_PX, SETTLED_PX = 0.04, 2e-4, 0.3
 LEFT_BLURS = 6.0
 MOST_CONVERGED = 0.5
 # A turn about the normal is unknown for targets of one centre; this prior merely keeps it at zero.

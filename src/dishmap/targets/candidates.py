@@ -41,7 +41,8 @@ class Candidates:
     detection (N,): index into the detections; center_px (N, 2); size_px (N,): root of the product of the half axes.
     ray (N, 3) unit, tangent (N, 3, 2): axes at right angles to it, like image x and y; shape (N, 2, 2): maps the unit
     circle to the ellipse, in tangents of angles along these axes; px_per_tangent (N, 2, 2). is_type (N, T): all printed circles are there;
-    may_be_type (N, T): some are not seen, but nothing contradicts.
+    may_be_type (N, T): some are not seen, but nothing contradicts, and it is no whole mark of another type; has_more (N, T):
+    there is something printed inside that the type does not have.
     """
 
     detection: Index
@@ -53,6 +54,7 @@ class Candidates:
     px_per_tangent: Array
     is_type: Flags
     may_be_type: Flags
+    has_more: Flags
 
     def __len__(self) -> int:
         return len(self.detection)
@@ -74,7 +76,7 @@ def mark_candidates(detections: Detections, marks: Marks, camera: Camera) -> Can
     those where the lens model does not hold.
     """
     size = np.sqrt(detections.semi_axes_px.prod(axis=1))
-    is_type, may_be = _types(detections, size, marks)
+    is_type, may_be, has_more = _types(detections, size, marks)
     index = np.flatnonzero(detections.dark & (is_type | may_be).any(axis=1) & ~_inside_another(detections, is_type))
     ray = camera.unproject(detections.center_px[index])
     tangent = tangent_axes(ray)
@@ -82,7 +84,8 @@ def mark_candidates(detections: Detections, marks: Marks, camera: Camera) -> Can
     with np.errstate(invalid="ignore", divide="ignore"):
         px_per_tangent = by_point @ tangent
         shape = invert_2x2(px_per_tangent) @ ellipse_matrices(detections.semi_axes_px[index], detections.angle_rad[index])
-    found = Candidates(index, detections.center_px[index], size[index], ray, tangent, shape, px_per_tangent, is_type[index], may_be[index])
+    center, types = detections.center_px[index], (is_type[index], may_be[index], has_more[index])
+    found = Candidates(index, center, size[index], ray, tangent, shape, px_per_tangent, *types)
     return found.take(np.flatnonzero(np.isfinite(ray).all(axis=1) & np.isfinite(shape).all(axis=(1, 2))))
 
 
@@ -108,8 +111,8 @@ def _inside_another(detections: Detections, is_type: Flags) -> Flags:
     return inside
 
 
-def _types(detections: Detections, size: Array, marks: Marks) -> tuple[Flags, Flags]:
-    """For each ellipse and type: whether all its nested circles are there, and whether nothing speaks against it (M, T)."""
+def _types(detections: Detections, size: Array, marks: Marks) -> tuple[Flags, Flags, Flags]:
+    """For each ellipse and type (M, T): `is_type`, `may_be_type` and `has_more` of `Candidates`."""
     holder, held = _nested_pairs(detections.parent)
     relevant = detections.dark[holder]
     holder, held = holder[relevant], held[relevant]
@@ -117,7 +120,7 @@ def _types(detections: Detections, size: Array, marks: Marks) -> tuple[Flags, Fl
     strong = (ratio >= STRAY_RATIO) & (detections.contrast[held] >= STRAY_CONTRAST * detections.contrast[holder])
     count = len(detections)
     is_type = np.zeros((count, len(marks.type_ratios)), dtype=bool)
-    may_be = np.zeros_like(is_type)
+    has_more = np.zeros_like(is_type)
     tolerance = RATIO_TOLERANCE + RATIO_TOLERANCE_PX / size[holder]
     for column, wanted in enumerate(marks.type_ratios):
         explained = np.zeros(len(held), dtype=bool)
@@ -130,10 +133,8 @@ def _types(detections: Detections, size: Array, marks: Marks) -> tuple[Flags, Fl
             lacking |= ~faint & (np.bincount(holder[near], minlength=count) < times)
         stray = np.bincount(holder[strong & ~explained], minlength=count) > 0
         is_type[:, column] = ~stray & ~lacking
-        may_be[:, column] = ~stray
-    # what is a whole mark of one type is not a damaged one of another
-    whole = is_type.any(axis=1, keepdims=True)
-    return is_type, may_be & ~is_type & ~whole
+        has_more[:, column] = stray
+    return is_type, ~has_more & ~is_type.any(axis=1, keepdims=True), has_more
 
 
 def _nested_pairs(parent: Index) -> tuple[Index, Index]:

@@ -28,7 +28,7 @@ ANCHORS = 3
 DISTANCE_TOLERANCE = 0.15
 CENTER_TOLERANCE = 0.35
 SIZE_TOLERANCE = 0.3
-FEWEST_VOTES = 3
+FEWEST_VOTES, LEAST_VOTES = 3, 0.4
 # The best of the hypotheses that agree about as well are kept.
 KEPT_PER_SEED, MOST_SORTED = 400, 1200
 
@@ -56,7 +56,7 @@ def match_neighbourhood(candidates: Candidates, seed: int, near: Index, layout: 
 
     near: candidates close to the seed, without it. Returns the hypotheses with the most votes, best first.
     """
-    q, near = _whitened(candidates, seed, near)
+    q, near = _whitened(candidates, seed, near[candidates.is_type[near].any(axis=1)])
     none = Hypotheses(seed, np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.int64), np.zeros(0))
     if len(q) < FEWEST_VOTES - 1:
         return none
@@ -76,12 +76,10 @@ def match_neighbourhood(candidates: Candidates, seed: int, near: Index, layout: 
     if not len(row):
         return none
     votes, misfit = _vote(q, w, fits, row, turn)
-    good = votes >= max(min(FEWEST_VOTES, len(q)), int(0.4 * len(q)))
-    order = np.lexsort((misfit[good], -votes[good]))
-    row, turn, votes, misfit = (values[good][order] for values in (row, turn, votes, misfit))
-    row, turn, votes, misfit = row[:MOST_SORTED], turn[:MOST_SORTED], votes[:MOST_SORTED], misfit[:MOST_SORTED]
-    first = _distinct(marks[row], turn)[:KEPT_PER_SEED]
-    return Hypotheses(seed, marks[row][first], np.angle(turn[first]).astype(float), votes[first], misfit[first])
+    good = np.flatnonzero(votes >= max(min(FEWEST_VOTES, len(q)), int(LEAST_VOTES * len(q))))
+    order = good[np.lexsort((misfit[good], -votes[good]))][:MOST_SORTED]
+    kept = order[_distinct(marks[row[order]], turn[order])][:KEPT_PER_SEED]
+    return Hypotheses(seed, marks[row[kept]], np.angle(turn[kept]).astype(float), votes[kept], misfit[kept])
 
 
 def _whitened(candidates: Candidates, seed: int, near: Index) -> tuple[Complex, Index]:

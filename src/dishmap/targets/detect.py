@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.errors import ImageError
-from dishmap.targets.ellipses import Fits, enclosing, fit_ellipses, contour_spread
+from dishmap.targets.ellipses import Fits, contour_spread, enclosing, fit_ellipses
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -83,9 +83,10 @@ def find_ellipses(gray: NDArray[Any], full_resolution: bool = False) -> Detectio
     gray: (H, W) uint8 or uint16. full_resolution: search a large image at full resolution even where half seems enough.
     Raises ImageError when the image is not such an array.
     """
-    if not isinstance(gray, np.ndarray) or gray.ndim != 2 or gray.dtype not in (np.uint8, np.uint16) or not gray.size:
-        found = f"{gray.dtype} {gray.shape}" if isinstance(gray, np.ndarray) else type(gray).__name__
-        raise ImageError(f"circles are searched in a grey image (H, W) of uint8 or uint16, not in {found}; convert it first")
+    if gray.ndim != 2 or gray.dtype not in (np.uint8, np.uint16) or not gray.size:
+        raise ImageError(
+            f"circles are searched in a grey image (H, W) of uint8 or uint16, not in {gray.dtype} {gray.shape}; convert it first"
+        )
     white = _white_level(gray)
     halve = gray.size > HALVE_ABOVE_PX and not full_resolution
     base = 2 if halve else 1
@@ -147,12 +148,11 @@ def _noise(image: Image) -> float:
 def _search(image: Image, reduction: int, noise: float) -> tuple[_Found, int]:
     """All ellipses of one image; also how many small blobs its contours hold."""
     if noise > SMOOTH_ABOVE_NOISE:
-        image, noise = cv2.GaussianBlur(image, (3, 3), 0), noise / 2.5
-    threshold, ink = _binarise(image, max(LEAST_CONTRAST, LEAST_CONTRAST_SIGMAS * noise))
-    contours, _ = cv2.findContours(ink, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    del ink
-    small = sum(1 for c in contours if 4 <= len(c) < FEWEST_POINTS)
-    contours = [c for c in contours if len(c) >= FEWEST_POINTS]
+        image, noise = np.asarray(cv2.GaussianBlur(image, (3, 3), 0), dtype=np.uint8), noise / 2.5
+    threshold, ink = _binarise(image, min(max(LEAST_CONTRAST, LEAST_CONTRAST_SIGMAS * noise), 255.0))
+    outlines, _ = cv2.findContours(ink, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    small = sum(1 for c in outlines if 4 <= len(c) < FEWEST_POINTS)
+    contours = [np.asarray(c, dtype=np.int32) for c in outlines if len(c) >= FEWEST_POINTS]
     if not contours:
         return _nothing(), small
     return _ellipses(image, threshold, contours, reduction), small
@@ -168,7 +168,7 @@ def _binarise(image: Image, least_contrast: float) -> tuple[Image, Image]:
         low, high = (f(image[first:last], kernel)[inner] for f in (cv2.erode, cv2.dilate))
         cv2.addWeighted(low, 0.5, high, 0.5, 0.0, dst=threshold[top:bottom])
         # contrast of the window against its own limit: high - low > max(least, part * high)
-        limit = cv2.max(cv2.convertScaleAbs(high, alpha=LEAST_RELATIVE_CONTRAST), least_contrast)
+        limit = np.maximum(cv2.convertScaleAbs(high, alpha=LEAST_RELATIVE_CONTRAST), np.uint8(least_contrast))
         edges = cv2.compare(cv2.subtract(high, low), limit, cv2.CMP_GT)
         cv2.bitwise_and(cv2.compare(image[top:bottom], threshold[top:bottom], cv2.CMP_LT), edges, dst=ink[top:bottom])
     return threshold, ink
@@ -261,7 +261,7 @@ def _to_crossing(image: Image, threshold: Image, points: Array, outward: Array) 
     return points + step * np.clip(part, 0, 1)[:, None], good, contrast
 
 
-def _darkest(flat: Image, at: NDArray[np.intp], width: int, here: Array) -> Array:
+def _darkest(flat: Image, at: NDArray[np.intp], width: int, here: NDArray[np.float32]) -> NDArray[np.float32]:
     """Darkest of the pixel and its eight neighbours, so that the contrast counts the ink's own depth."""
     for k in (1, -1, width, -width, width + 1, width - 1, -width + 1, -width - 1):
         here = np.minimum(here, flat[np.clip(at + k, 0, flat.size - 1)])
@@ -283,7 +283,7 @@ def _merged(fine: _Found, coarse: _Found) -> _Found:
         return fine if not len(coarse.center) else coarse
     tolerance = SAME_CENTER_PX * coarse.reduction[0]
     a, b = (np.column_stack([f.center, np.log(f.semi_axes.prod(axis=1)) / 2 * tolerance / SAME_SIZE]) for f in (fine, coarse))
-    distance, nearest = cKDTree(np.column_stack([a, 1e9 * fine.dark])).query(np.column_stack([b, 1e9 * coarse.dark]), p=np.inf)
+    distance, _ = cKDTree(np.column_stack([a, 1e9 * fine.dark])).query(np.column_stack([b, 1e9 * coarse.dark]), p=np.inf)
     new = coarse.take(np.flatnonzero(distance > tolerance))
     return _Found(*(np.concatenate([getattr(fine, n), getattr(new, n)]) for n in fine.__dataclass_fields__))
 

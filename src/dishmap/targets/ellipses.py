@@ -74,7 +74,8 @@ def contour_spread(points: Array, starts: Index) -> Array:
     quartic = [np.add.reduceat(t, starts) / counts for t in (xx * xx, xx * xy, xx * yy, xy * yy, yy * yy)]
     det = np.maximum(a * c - b * b, TINY)
     # mean of (c x^2 - 2 b x y + a y^2)^2 / det^2; the mean of the squared radius itself is 2
-    square = c * c * quartic[0] - 4 * b * c * quartic[1] + (4 * b * b + 2 * a * c) * quartic[2] - 4 * a * b * quartic[3] + a * a * quartic[4]
+    parts = (c * c, -4 * b * c, 4 * b * b + 2 * a * c, -4 * a * b, a * a)
+    square = sum(part * q for part, q in zip(parts, quartic, strict=True))
     return np.sqrt(np.maximum(square / det**2 / 4 - 1, 0.0))
 
 

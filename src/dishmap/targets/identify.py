@@ -329,14 +329,14 @@ def _problem(scene: Scene, pattern: Pattern, final: Embedding) -> str | None:
     name, advice = f"the pattern {pattern.name!r}", "check that it is the printed pattern"
     found, expected = seen_targets(scene, final)
     if len(marks) < FEWEST_MARKS or found < LEAST_SEEN_PART * expected:
-        return (f"only {found} of {expected} targets of {name} that should be in view were found; {advice}")
+        return f"only {found} of {expected} targets of {name} that should be in view were found; {advice}"
     whole = candidates.is_type[used, layout.type_index[marks]].mean()
     if whole < LEAST_WHOLE_PART:
-        return (f"{100 * (1 - whole):.0f} % of the circles found lack what {name} prints inside them; {advice}")
+        return f"{100 * (1 - whole):.0f} % of the circles found lack what {name} prints inside them; {advice}"
     scale = root_det(prediction.affine[marks])
     ratio = float(np.exp(np.median(prediction.log_ratio[marks])))
     if abs(np.log(ratio)) > np.log1p(SIZE_TOLERANCE + SIZE_TOLERANCE_PX / np.median(scale * layout.radius_mm[marks])):
-        return (f"circles in the places of {name} are {100 * (ratio - 1):+.0f} % off its size, compared with their distances; {advice}")
+        return f"circles in the places of {name} are {100 * (ratio - 1):+.0f} % off its size, compared with their distances; {advice}"
     roughness = float(np.nanmedian(prediction.residual_mm[marks] / layout.spacing_mm[marks]))
     if roughness > LARGEST_ROUGHNESS and final.misfit_px > LARGEST_MISFIT * np.median(scale * layout.spacing_mm[marks]):
         return (
@@ -344,7 +344,7 @@ def _problem(scene: Scene, pattern: Pattern, final: Embedding) -> str | None:
         )
     strange = strangers(scene, prediction, final.candidate)
     if strange > LARGEST_STRANGE_PART * len(marks):
-        return (f"{len(marks)} circles fit {name}, but {strange} more among them look like its marks and fit nowhere; {advice}")
+        return f"{len(marks)} circles fit {name}, but {strange} more among them look like its marks and fit nowhere; {advice}"
     return None
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,21 +89,23 @@ def robust_pose(pose: Pose, points_mm: Array, sights: Sights, steps: int = STEPS
             break
     sigma = _sigma(square)
     normal, _ = _normal_equations(residual, square, _jacobian(rotation, arm, sights.ray, across, residual, along), sigma)
-    return RigidFit(Pose(rotation, at - rotation @ middle), _cost(square, FLOOR_PX), sigma, np.linalg.inv(normal) * sigma**2, middle)
+    return RigidFit(
+        Pose(rotation, at - rotation @ middle), _cost(square, FLOOR_PX), sigma, np.asarray(np.linalg.inv(normal) * sigma**2), middle
+    )
 
 
 def unbent_misfit(pose: Pose, points_mm: Array, normals: Array, sights: Sights, bend_mm: float) -> float:
-    """Robust sigma (px) of the residuals across the images of the normals, after a pose fit in which each point may also
-    move by `bend_mm` (sigma) along its normal (n, 3).
+    """Robust sigma (px) of what neither a pose nor bending explains.
 
-    A bent surface moves marks along the normal only (stretching is far smaller), so a right match leaves noise here,
+    That is of residuals across the images of the normals (n, 3), after a pose fit in which each point may also move by
+    `bend_mm` (sigma) along its normal. A bent surface moves marks along the normal only (stretching is far smaller), so a right match leaves noise here,
     however much the surface is bent; a wrong one does not.
     """
     middle = points_mm.mean(axis=0)
     arm = points_mm - middle
     across = sights.px_per_tangent @ np.swapaxes(sights.tangent, 1, 2)
     rotation, at = pose.rotation, pose.apply(middle)
-    residual, square, along = _residual(rotation, at, arm, sights.ray, across)
+    residual, _, along = _residual(rotation, at, arm, sights.ray, across)
     for step_number in range(BENT_STEPS + 1):
         jacobian = _jacobian(rotation, arm, sights.ray, across, residual, along)
         # px per mm along the normal, and the unit vector across it
@@ -190,7 +193,7 @@ def _normal_equations(residual: Array, square: Array, jacobian: Array, sigma: fl
     return normal, rows @ residual.reshape(-1)
 
 
-def _small_turn(vector: Array) -> Array:
+def _small_turn(vector: NDArray[np.floating[Any]]) -> Array:
     """Rotation matrix of one rotation vector (Rodrigues' formula), without the cost of `rotation_from_vector`'s generality."""
     x, y, z = (float(v) for v in vector)
     angle = math.sqrt(x * x + y * y + z * z)

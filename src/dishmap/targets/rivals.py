@@ -145,8 +145,11 @@ def find_rivals(scene: Scene, placement: Embedding, seen: Observations) -> Rival
     hit = mark >= 0
     square = np.where(hit, ((moved - layout.center_mm[mark]) ** 2).sum(axis=2), 0.0)
     misfit = np.sqrt(square.sum(axis=1) / np.maximum(hit.sum(axis=1), 1)) / layout.spacing_mm.min()
-    # an observation that is no mark counts, and once more where a mark should be that looks different
-    cost = (~hit * _weights(placement, layout, seen)).sum(axis=1) + (~hit & (met >= 0)).sum(axis=1)
+    # an observation that is no mark counts, and more where a mark should be that looks different: a missing circle could be
+    # dirt or blur, but one that is seen must have been printed
+    clash = ~hit & (met >= 0)
+    printed = clash & scene.candidates.has_more[seen.candidate, layout.type_index[met]]
+    cost = (~hit * _weights(placement, layout, seen)).sum(axis=1) + clash.sum(axis=1) + printed.sum(axis=1)
     return Rivals(rotation, shift, mark, cost, misfit)
 
 

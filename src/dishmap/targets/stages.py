@@ -121,12 +121,20 @@ def start_groups(
         order = np.argsort(np.linalg.norm(poses.position_mm, axis=1), kind="stable")
         for part in np.array_split(order, -(-len(order) // GROUP_SIZE)):
             group = _first_group(camera, pattern, kind, index[part], poses.take(part), assumptions)
+            expected = _wholly_inside(group)
             group = _on_ellipses(group, pattern, detections, identity)
-            inside = np.asarray(camera.contains(group.outlines(), margin_px=1.0).all(axis=(1, 2)))
-            rejected += [(int(pattern.ids[i]), "it reaches beyond the image") for i in group.index[~inside]]
+            inside = _wholly_inside(group)
+            for i, there in zip(group.index[~inside], expected[~inside], strict=True):
+                rejected.append(
+                    (int(pattern.ids[i]), "too little of it was seen to find its place" if there else "it reaches beyond the image")
+                )
             if inside.any():
                 groups.append(regroup(group, inside))
     return groups, rejected
+
+
+def _wholly_inside(group: Group) -> Bool:
+    return np.asarray(group.batch.camera.contains(group.outlines(), margin_px=1.0).all(axis=(1, 2)))
 
 
 def regroup(group: Group, keep: Bool) -> Group:
