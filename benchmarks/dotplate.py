@@ -13,7 +13,6 @@ motion and any focal length are part of, and what remains is compared with the s
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -156,9 +155,8 @@ def report_repeat(files: list[Path], results: list[Map], plate: Pattern) -> None
     places = [(result.cloud.ids, result.cloud.center_px) for result in results]
     shape, deviations = common_shape(places, plate)
     seen = np.unique(np.concatenate([index for index, _ in places]))
-    print(
-        f"\nthe print: rms distance of the dots from a perfect lattice {1000 * rms(shape[seen] - plate.center_mm[seen, :2]):.1f} um per axis"
-    )
+    off = 1000 * rms(shape[seen] - plate.center_mm[seen, :2])
+    print(f"\nthe print: rms distance of the dots from a perfect lattice {off:.1f} um per axis")
     # homographies and the shape take some of the scatter away
     total = sum(d.size for d in deviations)
     grow = np.sqrt(total / (total - 8 * len(deviations) - 2 * len(seen)))
@@ -205,28 +203,15 @@ def report_focal(files: list[Path], plate: Pattern, focal_px: float) -> None:
 
 def report_program(files: list[Path], results: list[Map], plate: Pattern, camera: Camera) -> None:
     """The same through `dishmap map`, the points read back."""
-    program = shutil.which("dishmap", path=str(Path(sys.executable).parent))
-    if program is None:
-        print("\nskipped: the program `dishmap` is not installed beside this Python")
-        return
+    program = [sys.executable, "-c", "from dishmap.cli import main; main()"]
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         write_pattern(Path(folder) / "plate.json", plate)
         write_camera(Path(folder) / "camera.yaml", camera)
         for file, result in zip(files, results, strict=True):
             out = Path(folder) / file.stem
-            command = [
-                program,
-                "map",
-                str(file),
-                "--camera",
-                f"{folder}/camera.yaml",
-                "--pattern",
-                f"{folder}/plate.json",
-                "--out",
-                str(out),
-            ]
-            run = subprocess.run(command, capture_output=True, text=True, check=False)
+            options = ["--camera", f"{folder}/camera.yaml", "--pattern", f"{folder}/plate.json", "--out", str(out)]
+            run = subprocess.run([*program, "map", str(file), *options], capture_output=True, text=True, check=False)
             if run.returncode:
                 rows.append((file.stem, run.returncode, run.stderr.strip()[-160:], ""))
                 continue

@@ -3,8 +3,9 @@
     scripts/bench print_errors [--quick]
 
 The same plate is photographed as printed to size, with its ink spread outwards by 2 % of the largest radius, and recorded
-through a gamma of 2.2, each in several poses. A ring's edges move against each other, so its depth stays; a lone disc only looks larger, and its
-sigma must say so. Shift: mean of depth errors over all targets, which share the print error; largest: the worst photograph's mean.
+through a gamma of 2.2, each in several poses. A ring's edges move against each other, so its depth stays; a lone disc only looks
+larger, and its sigma must say so. Shift: mean of depth errors over all targets, which share the print error; largest: the worst
+photograph's mean.
 """
 
 from __future__ import annotations

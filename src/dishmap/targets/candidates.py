@@ -25,8 +25,9 @@ Index = NDArray[np.int64]
 # blurred hole in a thin ring shrinks.
 RATIO_TOLERANCE = 0.08
 RATIO_TOLERANCE_PX = 1.2
-# A nested circle of at least this radius (px) cannot go unseen except by glare or dirt.
-VISIBLE_RADIUS_PX = 4.5
+# A nested circle of at least this radius, and so far from those around and in it (px), cannot go unseen by blur, but only by
+# glare or dirt.
+VISIBLE_RADIUS_PX, VISIBLE_GAP_PX = 4.5, 4.0
 # Something light in a mark counts as a printed circle from this radius relative to the mark's, and this contrast relative to
 # the mark's own; less is dirt or a thin spot in the ink.
 STRAY_RATIO = 0.15
@@ -127,7 +128,8 @@ def _types(detections: Detections, size: Array, marks: Marks) -> tuple[Flags, Fl
         lacking = np.zeros(count, dtype=bool)
         for value, times in zip(*np.unique(wanted, return_counts=True), strict=True) if wanted else ():
             # what blur can close it can also shrink to any size
-            faint = value * size < VISIBLE_RADIUS_PX
+            others = np.abs(np.array([1.0, *wanted]) - value)
+            faint = (value * size < VISIBLE_RADIUS_PX) | (others[others > 0].min() * size < VISIBLE_GAP_PX)
             near = (ratio - value <= tolerance) & ((value - ratio <= tolerance) | faint[holder])
             explained |= near
             lacking |= ~faint & (np.bincount(holder[near], minlength=count) < times)

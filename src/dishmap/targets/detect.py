@@ -258,7 +258,7 @@ def _to_crossing(image: Image, threshold: Image, points: Array, outward: Array) 
     good &= best_value > level
     part = np.where(good, (level - here) / np.where(good, best_value - here, 1), 0)
     contrast = 2 * (level - _darkest(flat, at, w, here))
-    return points + step * np.clip(part, 0, 1)[:, None], good, contrast
+    return points + step * np.clip(part, 0, 1)[:, None], good, np.asarray(contrast, dtype=float)
 
 
 def _darkest(flat: Image, at: NDArray[np.intp], width: int, here: NDArray[np.float32]) -> NDArray[np.float32]:

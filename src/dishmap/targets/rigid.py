@@ -98,8 +98,8 @@ def unbent_misfit(pose: Pose, points_mm: Array, normals: Array, sights: Sights, 
     """Robust sigma (px) of what neither a pose nor bending explains.
 
     That is of residuals across the images of the normals (n, 3), after a pose fit in which each point may also move by
-    `bend_mm` (sigma) along its normal. A bent surface moves marks along the normal only (stretching is far smaller), so a right match leaves noise here,
-    however much the surface is bent; a wrong one does not.
+    `bend_mm` (sigma) along its normal. A bent surface moves marks along the normal only (stretching is far smaller), so a
+    right match leaves noise here, however much the surface is bent; a wrong one does not.
     """
     middle = points_mm.mean(axis=0)
     arm = points_mm - middle
