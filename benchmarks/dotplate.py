@@ -237,7 +237,8 @@ def main() -> None:
     report_repeat(files, results, plate)
     if not QUICK:
         report_focal([files[0], files[len(files) // 2 - 1], files[-1]], plate, focal)
-    report_program(files[:3] if QUICK else files, results, plate, camera)
+    count = 3 if QUICK else len(files)
+    report_program(files[:count], results[:count], plate, camera)
 
 
 if __name__ == "__main__":

@@ -127,7 +127,11 @@ class Measured:
 
 
 def measured(
-    scene: Scene, rng: np.random.Generator, assumptions: Assumptions | None = None, image: NDArray[Any] | None = None, nominal: Pattern | None = None
+    scene: Scene,
+    rng: np.random.Generator,
+    assumptions: Assumptions | None = None,
+    image: NDArray[Any] | None = None,
+    nominal: Pattern | None = None,
 ) -> Measured:
     """Photograph a scene and measure it; `image` replaces the photograph, `nominal` the pattern that the measurement is given."""
     simulation = simulate(scene, rng)

@@ -36,8 +36,8 @@ Array = NDArray[np.float64]
 SOLVED_PART = 1e-6
 # An adjustment stops when little is left to do in the mean square of all parameters; one of them may hold all of it.
 STOPPED_SIGMAS = STEP_SIGMAS * GEOMETRY**0.5
-# What two such fits from different sides differ by, root mean square: 4 % of the variance of each.
-EARLY_SIGMAS = 0.3
+# What two such fits of the same pixels from different sides differ by, root mean square.
+EARLY_SIGMAS = 0.1
 DISTANCE_MM = 500.0
 NOISE_GREY = 2.0
 RING = ring(2.0, 1.2)
@@ -207,7 +207,14 @@ def test_a_batch_is_its_targets_one_by_one() -> None:
             curvature_per_mm=batch.curvature_per_mm[[i]],
             priors=replace(p, normal=p.normal[[i]], normal_sigma_rad=p.normal_sigma_rad[[i]]),
         )
-        alone = adjust(single, pixels.only(mine, number), poses.take(np.array([i])), group.state.take(np.array([i])), Weighting((NOISE_GREY * 257) ** 2, 0.0, None), 20)
+        alone = adjust(
+            single,
+            pixels.only(mine, number),
+            poses.take(np.array([i])),
+            group.state.take(np.array([i])),
+            Weighting((NOISE_GREY * 257) ** 2, 0.0, None),
+            20,
+        )
         assert together.converged[i]
         assert alone.converged[0]
         gap = alone.poses.position_mm[0] - together.poses.position_mm[i]
@@ -242,11 +249,11 @@ def test_noise_is_what_the_photograph_holds() -> None:
     np.testing.assert_allclose(fit.information - np.swapaxes(fit.information, 1, 2), 0, atol=1e-4 * np.abs(fit.information).max())
 
 
-@given(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
-def test_normal_prior_measures_small_angles(about_x: float, about_y: float) -> None:
+@pytest.mark.parametrize("about", [(0.3, 0.0), (0.0, -0.4), (-0.5, 0.2)])
+def test_normal_prior_measures_small_angles(about: tuple[float, float]) -> None:
     """The pull on the two tilts is the turn that brings the normal back, for small angles."""
     group = facing_group(1, 0.0)
-    turn = np.radians(5) * np.array([about_x, about_y, 0.0])
+    turn = np.radians(5) * np.array([*about, 0.0])
     expected = group.poses.rotation @ rotation_from_vector(turn) @ [0.0, 0.0, 1.0]
     group = with_priors(group, normal=expected, normal_sigma_rad=np.array([0.1]))
     _, pull = prior_terms(group.poses, group.state, group.batch.priors)

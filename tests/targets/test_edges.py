@@ -190,7 +190,9 @@ def test_a_patch_beyond_the_lens_has_infinite_misfit() -> None:
 
 
 @given(st.floats(0.1, 3), st.floats(-0.6, 0.6), st.floats(0.3, 1.0), st.floats(0, 6.3), st.floats(0.3, 1.7))
-def test_edge_distance_leads_to_the_edge_where_the_map_is_affine(size: float, shear: float, squeeze: float, angle: float, part: float) -> None:
+def test_edge_distance_leads_to_the_edge_where_the_map_is_affine(
+    size: float, shear: float, squeeze: float, angle: float, part: float
+) -> None:
     """Along the returned normal, at the returned distance, lies the circle; to rounding."""
     jacobian = size * np.array([[1.0, shear], [0.0, squeeze]])
     radius, center = 10.0, np.array([2.0, -1.0])

@@ -169,7 +169,7 @@ def test_the_fine_grid_agrees_with_the_band_where_both_hold(tilt_deg: float) -> 
     band = target.columns()
     assert target.pixels.shape is None
     # the same pixels as one whole window
-    p, reach = target.pixels.patches, int(25 + 8)
+    p, reach = target.pixels.patches, (25 + 8)
     dv, du = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, 1, -1)
     s, t = ((d / p.scale_px[0]).astype(np.float32) for d in (du, dv))
     side = 2 * reach + 1
@@ -311,8 +311,10 @@ def test_rings_of_a_kind() -> None:
 def test_the_band_holds_every_pixel_near_an_edge_and_few_others() -> None:
     target = seen("axis", "ring", 20.0, 30.0, 0.8)
     p, blur = target.pixels, target.group.state.blur_px[0]
-    cover, _, _ = target.columns()
-    u, v = (np.rint(x[0][p.used[0]] * p.patches.scale_px[0]).astype(int) + a for x, a in ((p.s, p.patches.anchor_px[0, 0]), (p.t, p.patches.anchor_px[0, 1])))
+    u, v = (
+        np.rint(x[0][p.used[0]] * p.patches.scale_px[0]).astype(int) + a
+        for x, a in ((p.s, p.patches.anchor_px[0, 0]), (p.t, p.patches.anchor_px[0, 1]))
+    )
     chosen = set(zip(u.tolist(), v.tolist(), strict=True))
     assert len(chosen) == p.used.sum(), "no pixel twice"
     camera, pixel, focal = VIEWS["axis"]

@@ -32,7 +32,9 @@ def fitted(model: Array, residual: Array, blocks: bool = True, used: NDArray[np.
 def in_blocks(image: Array, rng: np.random.Generator) -> Array:
     """Blocks of 2x2 neighbours (RINGS, 4 BLOCKS) at random places of a noise image."""
     row, column = (rng.integers(0, n - 1, (RINGS, BLOCKS)) for n in image.shape)
-    return np.stack([image[row, column], image[row, column + 1], image[row + 1, column], image[row + 1, column + 1]], axis=-1).reshape(RINGS, -1)
+    return np.stack([image[row, column], image[row, column + 1], image[row + 1, column], image[row + 1, column + 1]], axis=-1).reshape(
+        RINGS, -1
+    )
 
 
 def test_white_noise_of_one_size() -> None:

@@ -52,7 +52,7 @@ TILT_WAVES = 2
 LEAST_FACING = 0.1
 FEWEST_MATCHES = 3
 # A surface bends by up to about this part of its half size; a placement is clean when a bent one leaves less than this part of
-# the spacing.
+# the distance between targets.
 BEND_PART, CLEAN_PART = 0.03, 0.02
 MOST_POSE_MARKS = 100
 WAVE_STEPS = 4
@@ -253,11 +253,15 @@ def _local_correction(layout: Layout, matched: Flags, residual: Array) -> tuple[
     return offset, gradient, support
 
 
+def misfit_part(layout: Layout, placement: Embedding) -> float:
+    """What neither a pose nor bending along the normal explains, as a part of the distance between targets."""
+    scale = root_det(placement.prediction.affine[placement.candidate >= 0])
+    return placement.misfit_px / (float(np.median(scale)) * layout.pitch_mm)
+
+
 def is_clean(layout: Layout, placement: Embedding) -> bool:
-    """Whether a pose and bending along the normal explain the matches, to a small part of the spacing."""
-    matched = placement.candidate >= 0
-    scale = root_det(placement.prediction.affine[matched])
-    return bool(placement.misfit_px < CLEAN_PART * np.median(scale * layout.spacing_mm[matched]))
+    """Whether a pose and bending along the normal explain the matches."""
+    return misfit_part(layout, placement) < CLEAN_PART
 
 
 def limits_mm(scene: Scene, prediction: Prediction, final: bool) -> Array:
@@ -327,6 +331,21 @@ def _look_alikes(scene: Scene, prediction: Prediction) -> Flags:
     size = np.log(candidates.size_px / (scale * layout.radius_mm[mark])) - prediction.log_ratio[mark]
     like = candidates.is_type.any(axis=1) & (np.abs(size) < np.log(STRANGER_SIZE))
     return np.asarray(like & (distance < STRANGER_PART * scale * layout.spacing_mm[mark]))
+
+
+def clashes(scene: Scene, prediction: Prediction, match: Index) -> tuple[int, int]:
+    """Number of marks in whose place a whole mark of another type is seen, and of those that have more printed in them."""
+    layout, candidates = scene.layout, scene.candidates
+    free = np.flatnonzero((match < 0) & prediction.known)
+    if not len(free):
+        return 0, 0
+    _, nearest = scene.tree.query(prediction.predicted_px[free])
+    away = candidates.center_px[nearest] - prediction.predicted_px[free]
+    in_plane = np.linalg.norm((invert_2x2(prediction.affine[free]) @ away[:, :, None])[..., 0], axis=1)
+    there = in_plane <= limits_mm(scene, prediction, final=True)[free]
+    types = layout.type_index[free]
+    other = there & candidates.is_type[nearest].any(axis=1) & ~candidates.is_type[nearest, types]
+    return int(other.sum()), int((other & candidates.has_more[nearest, types]).sum())
 
 
 def strangers(scene: Scene, prediction: Prediction, match: Index) -> int:

@@ -11,13 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from dishmap.camera.model import Camera
 from dishmap.errors import IdentityError
 from dishmap.targets.candidates import Candidates, mark_candidates
 from dishmap.targets.detect import Detections
 from dishmap.targets.ellipses import root_det
-from dishmap.targets.growth import Embedding, Scene, fit_pose, grow, is_clean, misfit_of, strangers
+from dishmap.targets.growth import Embedding, Scene, clashes, fit_pose, grow, is_clean, misfit_of, misfit_part, strangers
 from dishmap.targets.layout import Layout, layout_of
 from dishmap.targets.pattern import Pattern
 from dishmap.targets.rivals import Observations, Rivals, find_rivals, observe
@@ -46,12 +47,18 @@ GUESS_TURN_RAD, GUESS_SHIFT_MM = np.radians(20.0), 100.0
 # A find has at least this part of the targets that should be in view, this part of marks with all that is printed in them, not
 # more than this part of look-alikes among its marks that fit nowhere, and circles of the printed size to this part (and px: ink
 # spread and threshold).
-LEAST_SEEN_PART, LEAST_WHOLE_PART, LARGEST_STRANGE_PART = 0.25, 0.5, 0.5
+LEAST_SEEN_PART, LEAST_WHOLE_PART, LARGEST_STRANGE_PART = 0.25, 0.5, 0.25
 SIZE_TOLERANCE, SIZE_TOLERANCE_PX = 0.15, 0.7
-# Marks off the places that their neighbours give them, as a part of the spacing, in the median, and more than a bent surface
-# explains: the distances printed are other ones.
-LARGEST_ROUGHNESS, LARGEST_MISFIT = 0.03, 0.01
+# Marks off the places that their neighbours give them (as a part of the spacing, in the median), or off any bent surface (as a
+# part of the distance between targets), by more than this were printed at other distances; the first only if a bent surface
+# leaves more than the second number, since a strong bend shows there too.
+LARGEST_OFF, CLEARLY_CLEAN = 0.04, 0.003
+# Places that show a mark of another type, more than a few and this part of the matches, are a wrong or mirrored pattern; two are
+# if one of them has more printed in it than expected, which neither blur nor glare explains.
+FEW_CLASHES, LARGEST_CLASH_PART = 3, 0.05
 LISTED_POSES = 12
+# A rejected circle is put down to a mark within this part of the spacing, and its size is named beyond this ratio.
+NEAR_SPACING, ODD_SIZE = 0.5, 1.2
 # A placement needs this many marks; a further copy also this part of the first one's.
 FEWEST_MARKS = 4
 COPY_PART = 0.3
@@ -135,7 +142,7 @@ def identify(detections: Detections, pattern: Pattern, camera: Camera, hint: Hin
         placement = find_placement(scene, least)
         if placement is None:
             break
-        found = _options(scene, pattern, placement)
+        found = _options(scene, placement)
         problem = _problem(scene, pattern, found[0].placement)
         if problem and not options:
             raise IdentityError(problem)
@@ -167,7 +174,7 @@ def _check_enough(detections: Detections, candidates: Candidates, pattern: Patte
         )
 
 
-def _options(scene: Scene, pattern: Pattern, placement: Embedding) -> list[_Option]:
+def _options(scene: Scene, placement: Embedding) -> list[_Option]:
     """The placement or a better rival of it first, then its rivals with their deficits against it."""
     for _ in range(MOST_CHANGES):
         seen = observe(scene, placement)
@@ -337,42 +344,51 @@ def _problem(scene: Scene, pattern: Pattern, final: Embedding) -> str | None:
     ratio = float(np.exp(np.median(prediction.log_ratio[marks])))
     if abs(np.log(ratio)) > np.log1p(SIZE_TOLERANCE + SIZE_TOLERANCE_PX / np.median(scale * layout.radius_mm[marks])):
         return f"circles in the places of {name} are {100 * (ratio - 1):+.0f} % off its size, compared with their distances; {advice}"
-    roughness = float(np.nanmedian(prediction.residual_mm[marks] / layout.spacing_mm[marks]))
-    if roughness > LARGEST_ROUGHNESS and final.misfit_px > LARGEST_MISFIT * np.median(scale * layout.spacing_mm[marks]):
+    bent, rough = misfit_part(layout, final), float(np.nanmedian(prediction.residual_mm[marks] / layout.spacing_mm[marks]))
+    if bent > LARGEST_OFF or (rough > LARGEST_OFF and bent > CLEARLY_CLEAN):
+        off = 100 * max(bent, rough)
+        return f"circles are arranged like {name}, but their distances are off by {off:.0f} % and more; {advice}, and the camera"
+    other, more = clashes(scene, prediction, final.candidate)
+    if other > FEW_CLASHES + LARGEST_CLASH_PART * len(marks) or (more > 0 and other > 1):
         return (
-            f"circles are arranged like {name}, but their distances are off by {100 * roughness:.0f} % and more from mark to mark; {advice}"
+            f"{len(marks)} circles fit {name}, but {other} of its places show a target of another kind; {advice}, and that the photograph "
+            "is not mirrored"
         )
     strange = strangers(scene, prediction, final.candidate)
-    if strange > LARGEST_STRANGE_PART * len(marks):
+    if strange > 1 + LARGEST_STRANGE_PART * len(marks):
         return f"{len(marks)} circles fit {name}, but {strange} more among them look like its marks and fit nowhere; {advice}"
     return None
 
 
 def _identity(scene: Scene, final: Embedding, others: list[Alternative]) -> Identity:
+    candidates = scene.candidates
     marks, used = _pairs(final)
     predicted = scene.camera.project(final.fit.pose.apply(scene.layout.center_mm[marks]))
-    residual = np.linalg.norm(scene.candidates.center_px[used] - predicted, axis=1)
-    left = np.setdiff1d(np.flatnonzero(scene.candidates.is_type.any(axis=1)), used)
-    rejected = tuple(Rejection(int(scene.candidates.detection[i]), _reason(scene, final, int(i))) for i in left)
-    detection = scene.candidates.detection[used]
-    return Identity(final.fit.pose, marks, detection, residual, tuple(sorted(others, key=lambda o: o.deficit)), len(left), rejected)
+    residual = np.linalg.norm(candidates.center_px[used] - predicted, axis=1)
+    left = np.setdiff1d(np.flatnonzero(candidates.is_type.any(axis=1)), used)
+    reasons = _reasons(scene, final, left)
+    rejected = tuple(Rejection(int(i), reason) for i, reason in zip(candidates.detection[left], reasons, strict=True))
+    alternatives = tuple(sorted(others, key=lambda o: o.deficit))
+    return Identity(final.fit.pose, marks, candidates.detection[used], residual, alternatives, len(left), rejected)
 
 
-def _reason(scene: Scene, final: Embedding, candidate: int) -> str:
-    """Why a candidate is no mark."""
-    prediction, layout = final.prediction, scene.layout
-    distance = np.linalg.norm(prediction.predicted_px - scene.candidates.center_px[candidate], axis=1)
-    if not np.isfinite(distance).any():
-        return "no mark of the pattern is expected in view"
-    nearest = int(np.nanargmin(distance))
-    size = float(root_det(prediction.affine[nearest]))
-    if distance[nearest] > 0.5 * size * layout.spacing_mm[nearest]:
-        return "no mark of the pattern is expected there"
-    if final.candidate[nearest] >= 0:
-        return "the mark expected there was found beside it"
-    if not scene.candidates.is_type[candidate, layout.type_index[nearest]]:
-        return "it looks unlike the mark expected there"
-    log_size = np.log(scene.candidates.size_px[candidate] / (size * layout.radius_mm[nearest])) - prediction.log_ratio[nearest]
-    if abs(log_size) > np.log(1.2):
-        return f"it is {100 * (np.exp(log_size) - 1):+.0f} % off the size of the mark expected there"
-    return f"it lies {distance[nearest]:.1f} px from where its neighbours put the mark"
+def _reasons(scene: Scene, final: Embedding, left: Index) -> list[str]:
+    """Why each of the candidates `left` is no mark."""
+    prediction, layout, candidates = final.prediction, scene.layout, scene.candidates
+    seen = np.flatnonzero(np.isfinite(prediction.predicted_px).all(axis=1))
+    distance, nearest = cKDTree(prediction.predicted_px[seen]).query(candidates.center_px[left])
+    mark = seen[nearest]
+    scale = root_det(prediction.affine[mark])
+    ratio = candidates.size_px[left] / (scale * layout.radius_mm[mark] * np.exp(prediction.log_ratio[mark]))
+    cases = (
+        (distance > NEAR_SPACING * scale * layout.spacing_mm[mark], "no mark of the pattern is expected there"),
+        (final.candidate[mark] >= 0, "the mark expected there was found beside it"),
+        (~candidates.is_type[left, layout.type_index[mark]], "it looks unlike the mark expected there"),
+    )
+    reasons = []
+    for i in range(len(left)):
+        text = next((text for where, text in cases if where[i]), "")
+        if not text and abs(np.log(ratio[i])) > np.log(ODD_SIZE):
+            text = f"it is {100 * (ratio[i] - 1):+.0f} % off the size of the mark expected there"
+        reasons.append(text or f"it lies {distance[i]:.1f} px from where its neighbours put the mark")
+    return reasons

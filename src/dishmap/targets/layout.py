@@ -21,8 +21,8 @@ class Layout:
     """Marks of a pattern (K) with their neighbours (K, N), nearest first.
 
     center_mm (K, 3), axes (K, 3, 3) x, y and normal, radius_mm, type_index, target (K,); neighbour (K, N): indices, -1 where
-    the pattern has fewer; offset_mm (K, N, 2): neighbours in the mark's own plane; spacing_mm (K,): to the nearest mark; surface: the
-    nominal one.
+    the pattern has fewer; offset_mm (K, N, 2): neighbours in the mark's own plane; spacing_mm (K,): to the nearest mark; pitch_mm:
+    from target to target, in the median; surface: the nominal one.
     """
 
     center_mm: Array
@@ -33,6 +33,7 @@ class Layout:
     neighbour: Index
     offset_mm: Array
     spacing_mm: Array
+    pitch_mm: float
     surface: Surface
 
     def __len__(self) -> int:
@@ -54,4 +55,23 @@ def layout_of(pattern: Pattern) -> Layout:
         relative = marks.center_mm[index[:, 1:]] - marks.center_mm[:, None]
         offset[:, :count] = relative @ axes[:, :, :2]
         spacing = distance[:, 1]
-    return Layout(marks.center_mm, axes, marks.radius_mm, marks.type_index, marks.target, neighbour, offset, spacing, pattern.surface)
+    return Layout(
+        marks.center_mm,
+        axes,
+        marks.radius_mm,
+        marks.type_index,
+        marks.target,
+        neighbour,
+        offset,
+        spacing,
+        _pitch(pattern, spacing),
+        pattern.surface,
+    )
+
+
+def _pitch(pattern: Pattern, spacing: Array) -> float:
+    """Median distance of a target to the nearest other one; of marks, if there is one target only."""
+    if len(pattern) < 2:
+        return float(np.median(spacing))
+    distance, _ = cKDTree(pattern.center_mm).query(pattern.center_mm, k=2)
+    return float(np.median(distance[:, 1]))

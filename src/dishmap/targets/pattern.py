@@ -91,7 +91,9 @@ class TargetKind:
             raise PatternError("a circle's center_mm must be finite numbers in mm")
         good = (self.radius_mm >= SMALLEST_RADIUS_MM) & (self.radius_mm < LARGEST_MM)
         if not good.all():
-            raise PatternError(f"a circle's radius_mm must lie between {SMALLEST_RADIUS_MM} and {LARGEST_MM:g}, not {self.radius_mm[~good][0]}")
+            raise PatternError(
+                f"a circle's radius_mm must lie between {SMALLEST_RADIUS_MM} and {LARGEST_MM:g}, not {self.radius_mm[~good][0]}"
+            )
         self._check_nesting()
 
     def _check_nesting(self) -> None:
@@ -104,7 +106,9 @@ class TargetKind:
                     raise PatternError(f"circles {j} and {i} of a target kind cross; they must be disjoint or nested")
         for i, parent in enumerate(self.parent):
             if self.dark[i] == (self.dark[parent] if parent >= 0 else False):
-                raise PatternError(f"circle {i} of a target kind has the colour of what surrounds it; nested circles alternate, outermost are dark")
+                raise PatternError(
+                    f"circle {i} of a target kind has the colour of what surrounds it; nested circles alternate, outermost are dark"
+                )
 
     @cached_property
     def parent(self) -> NDArray[np.int64]:
@@ -242,7 +246,8 @@ def bent_print_mm(xy_mm: Array, curvature_per_mm: Array) -> Array:
 class Marks:
     """Outermost circles of all targets, with their nested circles: the things a detector finds.
 
-    target (M,): index of the target each belongs to; circle (M,): which circle of its kind; center_mm (M, 3) in the dish frame, on the surface; normal (M, 3);
+    target (M,): index of the target each belongs to; circle (M,): which circle of its kind; center_mm (M, 3) in the dish
+    frame, on the surface; normal (M, 3);
     radius_mm (M,); type_index (M,): equal for marks that look alike; type_ratios: for each type, the radii of the circles
     nested in it divided by its own, largest first.
     """

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from dishmap.targets.ellipses import invert_2x2, root_det
 from dishmap.targets.growth import Embedding, Scene, is_clean
 from dishmap.targets.layout import Layout
-from dishmap.targets.markgrid import MarkGrid, meet_surface
+from dishmap.targets.markgrid import meet_surface
 from dishmap.transforms import Pose
 
 Array = NDArray[np.float64]
@@ -31,6 +31,7 @@ PAIR_TOLERANCE = 0.15
 # for another, which may owe matches to a bent surface, a small part.
 SAMPLE = 64
 FIRST_LOOK, FIRST_ROOM = 12, 0.1
+MOST_MOTIONS = 250
 LEAST_EXPLAINED, LEAST_EXPLAINED_ROUGH = 0.3, 0.15
 LEFT_OVER_PART, LEFT_OVER = 0.1, 12
 # A match within this part of its radius, or these px, of where its neighbours put it has the greater weight.
@@ -127,17 +128,16 @@ def _on_surface(scene: Scene, placement: Embedding, index: Index) -> tuple[Array
 def find_rivals(scene: Scene, placement: Embedding, seen: Observations) -> Rivals:
     """All motions of the pattern that explain the observations about as well as the placement does."""
     layout = scene.layout
-    grid = scene.grid
     matched = np.flatnonzero(seen.mark >= 0)
     least = max(LEAST_EXPLAINED, 1 - LEFT_OVER_PART - LEFT_OVER / len(matched)) if is_clean(layout, placement) else LEAST_EXPLAINED_ROUGH
     rotations, shifts = [np.eye(3)[None]], [np.zeros((1, 3))]
     for anchor in _anchors(layout, seen.mark[matched]):
-        rotation, shift = _motions(placement, seen.place_mm[matched], layout, grid, int(anchor), least)
+        rotation, shift = _motions(scene, placement, seen.place_mm[matched], int(anchor), least)
         rotations.append(rotation)
         shifts.append(shift)
     rotation, shift = np.concatenate(rotations), np.concatenate(shifts)
     moved = seen.place_mm @ np.swapaxes(rotation, 1, 2) + shift[:, None]
-    met, mark = _marks_at(scene, seen, grid, moved)
+    met, mark = _marks_at(scene, seen, moved)
     # motions that give all observations the same marks are one; the first of each stays
     _, first = np.unique(((mark + 2) * np.sin(1.0 + np.arange(mark.shape[1]))).sum(axis=1).round(6), return_index=True)
     first = np.sort(first)
@@ -173,8 +173,9 @@ def _anchors(layout: Layout, marks: Index) -> Index:
     return np.array(chosen)
 
 
-def _motions(placement: Embedding, places: Array, layout: Layout, grid: MarkGrid, anchor: int, least: float) -> tuple[Array, Array]:
-    """Motions that carry one matched mark and a matched neighbour onto others that look alike, and explain a fair sample."""
+def _motions(scene: Scene, placement: Embedding, places: Array, anchor: int, least: float) -> tuple[Array, Array]:
+    """Motions that carry one matched mark and a matched neighbour onto others that could look so, and explain a fair sample."""
+    layout = scene.layout
     pairs = layout.neighbour[anchor]
     matched = np.flatnonzero((pairs >= 0) & (placement.candidate[pairs] >= 0))
     if not len(matched):
@@ -182,8 +183,9 @@ def _motions(placement: Embedding, places: Array, layout: Layout, grid: MarkGrid
     second = matched[0]
     arm = layout.offset_mm[anchor, second]
     length = float(np.linalg.norm(arm))
-    like = layout.type_index[layout.neighbour] == layout.type_index[pairs[second]]
-    like &= (layout.neighbour >= 0) & (layout.type_index == layout.type_index[anchor])[:, None]
+    looks = (scene.candidates.is_type | scene.candidates.may_be_type)[:, layout.type_index]
+    like = looks[placement.candidate[pairs[second]]][layout.neighbour] & (layout.neighbour >= 0)
+    like &= looks[placement.candidate[anchor]][:, None]
     with np.errstate(invalid="ignore"):
         like &= np.abs(np.hypot(layout.offset_mm[..., 0], layout.offset_mm[..., 1]) - length) <= PAIR_TOLERANCE * length
     mark, column = np.nonzero(like)
@@ -195,10 +197,12 @@ def _motions(placement: Embedding, places: Array, layout: Layout, grid: MarkGrid
     sample = np.unique(np.concatenate([order[: SAMPLE // 4], order[:: 1 + len(order) // SAMPLE]]))
     shift = layout.center_mm[mark] - rotation @ layout.center_mm[anchor]
     # a few of the sample first, to be rid of most motions
-    for chosen, part in ((sample[:: 1 + len(sample) // FIRST_LOOK], least - FIRST_ROOM), (sample, least)):
-        good = (grid.nearest(places[chosen] @ np.swapaxes(rotation, 1, 2) + shift[:, None]) >= 0).mean(axis=1) >= part
-        rotation, shift = rotation[good], shift[good]
-    return rotation, shift
+    for chosen, least_part in ((sample[:: 1 + len(sample) // FIRST_LOOK], least - FIRST_ROOM), (sample, least)):
+        part = (scene.grid.nearest(places[chosen] @ np.swapaxes(rotation, 1, 2) + shift[:, None]) >= 0).mean(axis=1)
+        good = np.flatnonzero(part >= least_part)
+        rotation, shift, part = rotation[good], shift[good], part[good]
+    best = np.argsort(-part, kind="stable")[:MOST_MOTIONS]
+    return rotation[best], shift[best]
 
 
 def _turned_frames(axes: Array, turn: Array) -> Array:
@@ -206,9 +210,9 @@ def _turned_frames(axes: Array, turn: Array) -> Array:
     return np.stack([c * axes[:, :, 0] + s * axes[:, :, 1], -s * axes[:, :, 0] + c * axes[:, :, 1], axes[:, :, 2]], axis=-1)
 
 
-def _marks_at(scene: Scene, seen: Observations, grid: MarkGrid, places_mm: Array) -> tuple[Index, Index]:
+def _marks_at(scene: Scene, seen: Observations, places_mm: Array) -> tuple[Index, Index]:
     """The mark at each observation's place (H, n, 3), and the same where it looks like the observation; -1 if none."""
-    met = grid.nearest(places_mm)
+    met = scene.grid.nearest(places_mm)
     looks = scene.candidates.is_type | scene.candidates.may_be_type
     alike = looks[seen.candidate, scene.layout.type_index[met]]
     alike &= np.abs(np.log(seen.radius_mm / scene.layout.radius_mm[met])) < SAME_LOG_SIZE

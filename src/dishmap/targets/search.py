@@ -98,7 +98,8 @@ def log10_chance(scene: Scene, placement: Embedding) -> float:
     """Logarithm of the number of placements as good that circles strewn at random would give.
 
     Each mark in view finds one of N circles of density d within the largest residual r with probability p = pi r^2 d;
-    three matches define the placement, and N circles times K marks times some turns are tried.
+    three matches define the placement, and N circles times K marks times some turns are tried. d is the density of the
+    circles that are no marks, in the image or around the pattern, whichever is greater.
     """
     marks = np.flatnonzero(placement.candidate >= 0)
     predicted = placement.prediction.predicted_px
@@ -106,14 +107,15 @@ def log10_chance(scene: Scene, placement: Embedding) -> float:
     inside[marks] = True
     n, m = len(marks), int(inside.sum())
     low, high = predicted[inside].min(axis=0), predicted[inside].max(axis=0)
-    center = scene.candidates.center_px[scene.candidates.is_type.any(axis=1)]
-    near = int(((center >= low - 1) & (center <= high + 1)).all(axis=1).sum())
+    usable = np.flatnonzero(scene.candidates.is_type.any(axis=1))
+    center = scene.candidates.center_px[np.setdiff1d(usable, placement.candidate)]
+    near = ((center >= low) & (center <= high)).all(axis=1).sum() / float(np.prod(np.maximum(high - low, 1.0)))
+    density = max(near, (len(center) + 1) / (scene.camera.width_px * scene.camera.height_px))
     # the residual in px: that in mm times the scale of the map
     scale = root_det(placement.prediction.affine[marks])
     reach = max(float((np.nan_to_num(placement.prediction.residual_mm[marks]) * scale).max()), SMALLEST_REACH_PX)
-    p = min(0.5, np.pi * reach**2 * max(near, 1) / float(np.prod(np.maximum(high - low, 1.0))))
     choices = (math.lgamma(m + 1) - math.lgamma(n + 1) - math.lgamma(m - n + 1)) / math.log(10)
-    return math.log10(len(center) * len(scene.layout) * TURNS_TRIED) + choices + (n - 3) * math.log10(p)
+    return math.log10(len(usable) * len(scene.layout) * TURNS_TRIED) + choices + (n - 3) * math.log10(min(0.5, np.pi * reach**2 * density))
 
 
 def worth(placement: Embedding) -> tuple[int, float]:

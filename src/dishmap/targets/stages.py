@@ -307,7 +307,7 @@ def full_fit(image: NDArray[Any], pattern: Pattern, coarse: Coarse, shared: Shar
     group = coarse.group
     expected = shared.camera_from_dish.rotate(pattern.normal[group.index])
     blur = float(np.median(group.state.blur_px))
-    priors = replace(group.batch.priors, normal=expected, normal_sigma_rad=np.full(len(expected), shared.normal_sigma_rad), blur_px=blur)
+    priors = replace(group.batch.priors, normal=expected, normal_sigma_rad=_prior_sigma(coarse, expected, shared), blur_px=blur)
     priors = replace(priors, log_gamma=shared.log_gamma, log_gamma_sigma=shared.log_gamma_sigma)
     poses, state = with_other_priors(coarse.adjusted, group.batch.priors, priors)
     group = replace(group, poses=poses, state=state, batch=replace(group.batch, priors=priors))
@@ -317,12 +317,24 @@ def full_fit(image: NDArray[Any], pattern: Pattern, coarse: Coarse, shared: Shar
     weighting = Weighting(shared.noise.base, shared.noise.slope, cut)
     adjusted = adjust(batch, pixels, group.poses, group.state, weighting, FULL_STEPS)
     strays = angle_between_rad(adjusted.poses.rotation[..., 2], expected) > STRAY_SIGMAS * shared.normal_sigma_rad
-    if strays.any():
-        sigma = np.where(strays, FIRST_NORMAL_SIGMA_RAD, shared.normal_sigma_rad)
+    if (strays & (priors.normal_sigma_rad < FIRST_NORMAL_SIGMA_RAD)).any():
+        sigma = np.where(strays, FIRST_NORMAL_SIGMA_RAD, priors.normal_sigma_rad)
         batch = replace(batch, priors=replace(priors, normal_sigma_rad=sigma))
         adjusted = adjust(batch, pixels, adjusted.poses, adjusted.state, weighting, FULL_STEPS)
     adjusted, pixels = _clear_of_obstacles(batch, pixels, adjusted, weighting)
     return replace(group, batch=batch, poses=adjusted.poses, state=adjusted.state), adjusted, pixels
+
+
+def _prior_sigma(coarse: Coarse, expected: Array, shared: Shared) -> Array:
+    """Prior sigma (T,) on normals: that of the surface, but wide for targets whose pixels plainly say otherwise.
+
+    Twice STRAY_SIGMAS, because a target seen face on shows the size of its tilt through noise alone at about twice the sigma
+    that its normal equations give.
+    """
+    tilt, covariance = free_tilt(coarse, expected.T)
+    width = covariance + shared.normal_sigma_rad**2 * np.eye(2)
+    far = np.einsum("ti,tij,tj->t", tilt, np.linalg.inv(width), tilt) > (2 * STRAY_SIGMAS) ** 2
+    return np.where(far & coarse.adjusted.converged, FIRST_NORMAL_SIGMA_RAD, shared.normal_sigma_rad)
 
 
 def _clear_of_obstacles(batch: Batch, pixels: RingPixels, fit: Adjusted, weighting: Weighting) -> tuple[Adjusted, RingPixels]:
