@@ -33,17 +33,22 @@ def calibrate_command(photos: Sequence[Path], board: str, corners: tuple[int, in
     """Calibrate a camera from 10 to 20 photographs of a flat board, tilted to all sides, with fixed focus and zoom."""
     from dishmap.camera.calibrate import calibrate
     from dishmap.camera.chessboard import find_boards
-    from dishmap.io.atomic import output_folder
+    from dishmap.io.atomic import output_folder, write_text
     from dishmap.io.camera_file import write_camera
+    from dishmap.report import calibration_report
 
-    refuse_overwriting(out, list(photos))
+    page = out.with_suffix(".html")
+    for file in (out, page):
+        refuse_overwriting(file, list(photos))
     with output_folder(out.parent):
         names = _names(photos)
         with progress("looking for the board") as tell:
             search = find_boards(_photographs(photos, names), corners, square_mm, len(photos), tell)
         result = calibrate(search.views, search.width_px, search.height_px, LENSES[lens])
         write_camera(out, result.camera, result)
+        write_text(page, calibration_report(result, f"Calibration of {out.name}"))
     _report(result, search.rejected, names, out)
+    say(f"report: {page}")
 
 
 def _names(photos: Sequence[Path]) -> list[str]:

@@ -45,7 +45,7 @@ SECOND_REDUCTION = 4
 # Contours: fewest points; the largest spread (see `contour_spread`), to which each pixel of a small contour adds; and the
 # limits that an ellipse must meet.
 FEWEST_POINTS = 8
-LARGEST_SPREAD = (0.16, 1.5)
+LARGEST_SPREAD = (0.16, 2.2)
 LEAST_GOOD_POINTS = 0.6
 SMALLEST_SEMI_AXIS_PX = 1.2
 LEAST_AXIS_RATIO = 0.2

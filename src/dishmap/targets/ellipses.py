@@ -65,7 +65,7 @@ def ellipse_matrices(semi_axes: Array, angle_rad: Array) -> Array:
 def contour_spread(points: Array, starts: Index) -> Array:
     """Relative standard deviation (M,) of the squared radius of each contour, scaled to unit second moments.
 
-    Zero for an ellipse sampled evenly; 0.19 and more for parallelograms. A cheap test before anything is fitted.
+    Zero for an ellipse sampled evenly; 0.22 for parallelograms. A cheap test before anything is fitted.
     """
     counts = _counts(points, starts)
     x, y = _centred(points, starts, counts)[0].T
