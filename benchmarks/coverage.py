@@ -4,7 +4,8 @@
 
 Every photograph draws its own camera (focal length, distortion or fisheye), pose, kind and size of target, blur, noise (with shot noise
 in half of them), shading, 8 or 16 bits, and plate, bent plate or dish. In a fifth of them the targets stand so close that the blur of
-one reaches into the next, which the fit does not know; they are told apart and left out of the other rows. Rejected targets are left out, flagged ones are told apart: a flag warns.
+one reaches into the next, which the fit does not know: these have a row of their own and are left out of the others. Rejected targets
+are left out too; flagged ones are told apart: a flag warns.
 An interval of 95 % that is true covers 95 % within the +- given, which is chance alone (targets of one photograph share a little more).
 """
 
@@ -149,9 +150,8 @@ def main() -> None:
         _tell_outliers(seed, shots[-1])
     crowd, shots = [s.errors for s in shots if s.crowded], [s for s in shots if not s.crowded]
     every = join([s.errors for s in shots])
-    print(
-        f"{SEEDS} photographs, {asked} targets wholly in view, {len(every)} + {sum(map(len, crowd))} crowded ones measured, {wrong} wrong names"
-    )
+    print(f"{SEEDS} photographs, {asked} targets wholly in view, {len(every)} measured, {wrong} wrong names")
+    print(f"{sum(map(len, crowd))} more measured that stand crowded")
     print(f"{refused} targets in photographs that were refused")
     header = ("targets", "+-", "x %", "y %", "z %", "u %", "v %", "rms z/s", "rms u/s", "bias z/s", "bias uv/s")
     header = ("of", *header, "normal deg", "claimed", "rms n/s")

@@ -51,8 +51,8 @@ LEAST_SEEN_PART, LEAST_WHOLE_PART, LARGEST_STRANGE_PART = 0.25, 0.5, 0.25
 SIZE_TOLERANCE, SIZE_TOLERANCE_PX = 0.15, 0.7
 # Marks off the places that their neighbours give them (as a part of the spacing, in the median), or off any bent surface (as a
 # part of the distance between targets), by more than this were printed at other distances; the first only if a bent surface
-# leaves more than the second number, since a strong bend shows there too.
-LARGEST_OFF, CLEARLY_CLEAN = 0.04, 0.003
+# leaves more than the numbers behind it, since a strong bend shows there too.
+LARGEST_OFF, CLEARLY_CLEAN, CLEARLY_CLEAN_PX = 0.04, 0.005, 0.4
 # Places that show a mark of another type, more than a few and this part of the matches, are a wrong or mirrored pattern; two are
 # if one of them has more printed in it than expected, which neither blur nor glare explains.
 FEW_CLASHES, LARGEST_CLASH_PART = 3, 0.05
@@ -345,7 +345,7 @@ def _problem(scene: Scene, pattern: Pattern, final: Embedding) -> str | None:
     if abs(np.log(ratio)) > np.log1p(SIZE_TOLERANCE + SIZE_TOLERANCE_PX / np.median(scale * layout.radius_mm[marks])):
         return f"circles in the places of {name} are {100 * (ratio - 1):+.0f} % off its size, compared with their distances; {advice}"
     bent, rough = misfit_part(layout, final), float(np.nanmedian(prediction.residual_mm[marks] / layout.spacing_mm[marks]))
-    if bent > LARGEST_OFF or (rough > LARGEST_OFF and bent > CLEARLY_CLEAN):
+    if bent > LARGEST_OFF or (rough > LARGEST_OFF and bent > CLEARLY_CLEAN and final.misfit_px > CLEARLY_CLEAN_PX):
         off = 100 * max(bent, rough)
         return f"circles are arranged like {name}, but their distances are off by {off:.0f} % and more; {advice}, and the camera"
     other, more = clashes(scene, prediction, final.candidate)
