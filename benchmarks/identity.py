@@ -130,7 +130,7 @@ def main() -> None:
     rows, notes = [], []
     for number, case in enumerate(CASES):
         total = np.zeros(4, int)
-        refused = refused_whole = 0
+        refused = refused_whole = crashed = 0
         for seed in range(SEEDS):
             rng = np.random.default_rng([2018, number, seed])
             scene, hint = draw_scene(case, rng)
@@ -144,6 +144,10 @@ def main() -> None:
                 if case.name != "no marks, no hint":
                     notes.append(f"refused: {case.name}, seed {seed}, {scene.pattern.name}: {error}")
                 continue
+            except Exception as error:  # a crash is a result here, and must not hide the others
+                crashed += 1
+                notes.append(f"crashed: {case.name}, seed {seed}, {scene.pattern.name}: {type(error).__name__}: {error}")
+                continue
             found, invented, wrong = counts(result, picture.truth, scene)
             total += [whole, found, invented, wrong]
             if found < whole or invented or wrong:
@@ -152,8 +156,10 @@ def main() -> None:
                 said = "; ".join(f"{i}: {told.get(i, 'not seen')}" for i in missing)
                 notes.append(f"{case.name}, seed {seed}, {scene.pattern.name}: invented {invented}, wrong {wrong}, missing {said}")
         share = 100 * total[1] / max(total[0], 1)
-        rows.append((case.name, SEEDS, refused, refused_whole, *map(int, total[:2]), share, int(total[0] - total[1]), *map(int, total[2:])))
-    header = ("case", "photographs", "refused", "their targets", "whole", "found", "found %", "missed", "invented", "wrong")
+        rows.append(
+            (case.name, SEEDS, crashed, refused, refused_whole, *map(int, total[:2]), share, int(total[0] - total[1]), *map(int, total[2:]))
+        )
+    header = ("case", "photographs", "crashed", "refused", "their targets", "whole", "found", "found %", "missed", "invented", "wrong")
     print_table(header, rows, "Identity in random scenes")
     if notes:
         print("\nwhat was missed or refused:")

@@ -350,6 +350,17 @@ def test_large_lattice_is_named_from_three_odd_dots() -> None:
         identify(plain.detections, pattern, NARROW, Upright())
 
 
+@pytest.mark.parametrize("hint", [None, Upright(), "guess"])
+def test_few_dots_of_a_large_plain_lattice_are_never_named(hint: Hint | str) -> None:
+    """Thousands of placements explain the dots; those that the hint allows are a few of them, and must not be overlooked."""
+    pattern = plate(30, 30, 20.0, disc(5.0))
+    pose = Pose(UP @ rotation_from_vector([0.2, -0.1, 0.1]), np.array([35.0, -60.0, 120.0]))
+    seen = see(Scene(pattern, NARROW, pose))
+    assert 10 < len(seen.truth) < 50
+    with pytest.raises(IdentityError, match="ways that the photograph does not tell apart"):
+        identify(seen.detections, pattern, NARROW, guess_near(pose, 3) if isinstance(hint, str) else hint)
+
+
 def test_a_thousand_targets() -> None:
     pattern = plate(32, 33, 25.0, disc(), orientation_marks=True)
     camera = Camera(4608, 3456, [4000.0, 4000.0], [2303.5, 1727.5])

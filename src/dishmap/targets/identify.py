@@ -8,6 +8,7 @@ the user's hint leaves exactly one of them, all are listed and none is chosen.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,11 +40,15 @@ ROUGH_MISFIT, MOST_REGROWN = 0.04, 6
 MOST_CHANGES = 4
 # Rivals that are looked at in full when they explain as much, and how many that do not are reported as ruled out; options that
 # agree on this part of their marks are one.
-MOST_OPTIONS, RULED_OUT_LISTED = 64, 3
+MOST_OPTIONS, RULED_OUT_LISTED = 24, 3
 SAME_PART = 0.5
 # What the hints promise.
 UPRIGHT_RAD = np.radians(45.0)
 GUESS_TURN_RAD, GUESS_SHIFT_MM = np.radians(20.0), 100.0
+# Room for poses that are not refined yet.
+ROOM = 1.4
+# The rotation camera_from_dish of a camera that looks straight at an upright pattern.
+UPSIDE = np.diag([1.0, -1.0, -1.0])
 # A find has at least this part of the targets that should be in view, this part of marks with all that is printed in them, not
 # more than this part of look-alikes among its marks that fit nowhere, and circles of the printed size to this part (and px: ink
 # spread and threshold).
@@ -142,7 +147,7 @@ def identify(detections: Detections, pattern: Pattern, camera: Camera, hint: Hin
         placement = find_placement(scene, least)
         if placement is None:
             break
-        found = _options(scene, placement)
+        found = _options(scene, placement, hint)
         problem = _problem(scene, pattern, found[0].placement)
         if problem and not options:
             raise IdentityError(problem)
@@ -174,11 +179,12 @@ def _check_enough(detections: Detections, candidates: Candidates, pattern: Patte
         )
 
 
-def _options(scene: Scene, placement: Embedding) -> list[_Option]:
+def _options(scene: Scene, placement: Embedding, hint: Hint) -> list[_Option]:
     """The placement or a better rival of it first, then its rivals with their deficits against it."""
     for _ in range(MOST_CHANGES):
         seen = observe(scene, placement)
-        rivals = find_rivals(scene, placement, seen)
+        prefer = partial(_about_agree, placement.fit.pose, hint)
+        rivals = find_rivals(scene, placement, seen, prefer)
         order = np.argsort(rivals.cost[1:], kind="stable") + 1
         best = int(order[0]) if len(order) else 0
         moved = _moved(scene, placement, seen, rivals, best) if rivals.cost[best] < rivals.cost[0] else None
@@ -191,8 +197,11 @@ def _options(scene: Scene, placement: Embedding) -> list[_Option]:
     options = [_Option(scene, placement, placement.fit.pose, _pairs(placement), 0.0)]
     options += [_rough_option(scene, placement, other) for other in rough]
     exact = [int(h) for h in order if clean or not _is_rough(rivals, int(h))]
-    close = [h for h in exact if rivals.cost[h] - rivals.cost[0] < DECISIVE][:MOST_OPTIONS]
-    for h in close + [h for h in exact if h not in close][:RULED_OUT_LISTED]:
+    close = [h for h in exact if rivals.cost[h] - rivals.cost[0] < DECISIVE]
+    # those that the hint allows first: none of them may be overlooked
+    allowed = prefer(rivals.rotation, rivals.shift_mm)
+    kept = sorted(close, key=lambda h: not allowed[h])[:MOST_OPTIONS]
+    for h in kept + [h for h in exact if h not in close][:RULED_OUT_LISTED]:
         option = _exact_option(scene, placement, seen, rivals, h, float(rivals.cost[h] - rivals.cost[0]))
         options += [option] if option is not None else []
     return _distinct(options, scene.layout)
@@ -277,9 +286,10 @@ def _chosen(options: list[_Option], hint: Hint, pattern: Pattern, copies: int) -
             f"the pattern {pattern.name!r} was found, but not {said}: {_listing(options, hint)}; correct the hint, or turn the photograph"
         )
     many = f"{copies} copies of the pattern are in view and" if copies > 1 else "the pattern"
+    ways = f"{len(allowed)} ways" if len(allowed) < MOST_OPTIONS else "very many ways"
     advice = "give --upright or a --pose-guess" if hint is None else "give a closer --pose-guess"
     raise IdentityError(
-        f"{many} {pattern.name!r} could sit in {len(allowed)} ways that the photograph does not tell apart: {_listing(allowed, hint)}; "
+        f"{many} {pattern.name!r} could sit in {ways} that the photograph does not tell apart: {_listing(allowed, hint)}; "
         f"{advice}, show more of the pattern, or print it with orientation marks"
     )
 
@@ -293,6 +303,21 @@ def _agrees(pose: Pose, hint: Hint) -> bool:
     return True
 
 
+def _about_agree(pose: Pose, hint: Hint, rotation: Array, shift: Array) -> NDArray[np.bool_]:
+    """Which motions (H, 3, 3), (H, 3) of the pattern bring a pose to about where the hint allows it."""
+    turned = pose.rotation @ np.swapaxes(rotation, 1, 2)
+    if isinstance(hint, Upright):
+        relative = UPSIDE @ turned
+        roll = np.arctan2(relative[:, 1, 0] - relative[:, 0, 1], relative[:, 0, 0] + relative[:, 1, 1])
+        return np.asarray(np.abs(roll) < ROOM * UPRIGHT_RAD)
+    if isinstance(hint, PoseGuess):
+        moved = pose.translation_mm - (turned @ shift[:, :, None])[..., 0]
+        cosine = (np.einsum("hij,ij->h", turned, hint.camera_from_dish.rotation) - 1) / 2
+        far = np.linalg.norm(moved - hint.camera_from_dish.translation_mm, axis=1)
+        return np.asarray((cosine > np.cos(ROOM * GUESS_TURN_RAD)) & (far < ROOM * GUESS_SHIFT_MM))
+    return np.ones(len(rotation), dtype=bool)
+
+
 def _difference(pose: Pose, other: Pose) -> tuple[float, float]:
     turn = np.linalg.norm((pose.inverse() @ other).rotation_vector_rad)
     return float(turn), float(np.linalg.norm(pose.translation_mm - other.translation_mm))
@@ -304,7 +329,7 @@ def roll_rad(pose: Pose) -> float:
     The twist about z of dish_from_upright, the rest being a tilt about an axis at right angles to z (swing-twist
     decomposition): a turn of the pattern about its own z adds to it exactly.
     """
-    relative = np.diag([1.0, -1.0, -1.0]) @ pose.rotation
+    relative = UPSIDE @ pose.rotation
     return float(np.arctan2(relative[1, 0] - relative[0, 1], relative[0, 0] + relative[1, 1]))
 
 

@@ -30,7 +30,7 @@ def meet_surface(surface: Surface, origin: Array, ray: Array) -> Array:
         root = np.sqrt(b * b - 4 * a * c)
         # each form is exact where the other loses digits or divides by zero
         t = np.where(b > 0, -2 * c / (b + root), (root - b) / (2 * a))
-        return np.where(t > 0, t, np.nan)
+        return np.where((t > 0) & (t < NOWHERE_MM), t, np.nan)
 
 
 class MarkGrid:

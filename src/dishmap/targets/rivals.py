@@ -7,6 +7,7 @@ the pattern alone, without noise; no search in the image can miss one.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -125,14 +126,20 @@ def _on_surface(scene: Scene, placement: Embedding, index: Index) -> tuple[Array
     return place, radius / np.exp(log_ratio)
 
 
-def find_rivals(scene: Scene, placement: Embedding, seen: Observations) -> Rivals:
-    """All motions of the pattern that explain the observations about as well as the placement does."""
+Preference = Callable[[Array, Array], Flags]
+
+
+def find_rivals(scene: Scene, placement: Embedding, seen: Observations, prefer: Preference) -> Rivals:
+    """Motions of the pattern that explain the observations about as well as the placement does.
+
+    prefer: says of motions (H, 3, 3) and (H, 3) which matter most; where there are very many, these are kept.
+    """
     layout = scene.layout
     matched = np.flatnonzero(seen.mark >= 0)
     least = max(LEAST_EXPLAINED, 1 - LEFT_OVER_PART - LEFT_OVER / len(matched)) if is_clean(layout, placement) else LEAST_EXPLAINED_ROUGH
     rotations, shifts = [np.eye(3)[None]], [np.zeros((1, 3))]
     for anchor in _anchors(layout, seen.mark[matched]):
-        rotation, shift = _motions(scene, placement, seen.place_mm[matched], int(anchor), least)
+        rotation, shift = _motions(scene, placement, seen.place_mm[matched], int(anchor), least, prefer)
         rotations.append(rotation)
         shifts.append(shift)
     rotation, shift = np.concatenate(rotations), np.concatenate(shifts)
@@ -173,7 +180,7 @@ def _anchors(layout: Layout, marks: Index) -> Index:
     return np.array(chosen)
 
 
-def _motions(scene: Scene, placement: Embedding, places: Array, anchor: int, least: float) -> tuple[Array, Array]:
+def _motions(scene: Scene, placement: Embedding, places: Array, anchor: int, least: float, prefer: Preference) -> tuple[Array, Array]:
     """Motions that carry one matched mark and a matched neighbour onto others that could look so, and explain a fair sample."""
     layout = scene.layout
     pairs = layout.neighbour[anchor]
@@ -201,7 +208,7 @@ def _motions(scene: Scene, placement: Embedding, places: Array, anchor: int, lea
         part = (scene.grid.nearest(places[chosen] @ np.swapaxes(rotation, 1, 2) + shift[:, None]) >= 0).mean(axis=1)
         good = np.flatnonzero(part >= least_part)
         rotation, shift, part = rotation[good], shift[good], part[good]
-    best = np.argsort(-part, kind="stable")[:MOST_MOTIONS]
+    best = np.lexsort((-part, ~prefer(rotation, shift)))[:MOST_MOTIONS]
     return rotation[best], shift[best]
 
 
