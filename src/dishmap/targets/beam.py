@@ -21,8 +21,9 @@ Index = NDArray[np.int64]
 STAGES = ((12, 100), (40, 25), (120, 6), (400, 3))
 STEPS = 2
 HANDED_ON = 3
-# Neighbours of the seed whose matches are handed on.
+# Neighbours of the seed whose matches are handed on; all matches are if this part of them lies within a fifth of the soft part.
 SURE = 30
+EXACT_PART, EXACT_WEIGHT = 0.9, 1 / (1 + 0.2**2)
 # Residuals well above this part of the spacing of marks have little weight.
 SOFT_PART = 0.1
 # Poses that put the seed on the same mark and are turned alike to this step are one; weights that make a number of the key.
@@ -58,13 +59,21 @@ def sort_out(scene: Scene, guesses: Hypotheses) -> list[Ranked]:
         rotation, shift, mark = rotation[best], shift[best], mark[best]
         if count >= len(order):
             break
-    ranked = []
-    for h in range(min(len(rotation), HANDED_ON)):
-        # far from the seed a bent surface may have led to the wrong marks: growth finds these anew
-        hit = np.flatnonzero(mark[h, :SURE] >= 0)
-        marks, first = np.unique(mark[h][hit], return_index=True)
-        ranked.append(Ranked(Pose(rotation[h], shift[h]), marks, near[hit[first]], int((mark[h] >= 0).sum())))
-    return ranked
+    few = slice(0, HANDED_ON)
+    _, weight, _, _ = _residual(scene, rotation[few], shift[few], near, mark[few])
+    return [_ranked(Pose(rotation[h], shift[h]), mark[h], near, weight[h]) for h in range(len(weight))]
+
+
+def _ranked(pose: Pose, mark: Index, near: Index, weight: Array) -> Ranked:
+    """What a pose pairs: all of it if it lies exactly, else only what is near the seed.
+
+    Far from the seed a bent surface may have led to the wrong marks; growth finds these anew.
+    """
+    hit = np.flatnonzero(mark >= 0)
+    exact = len(hit) > 0 and (weight[hit] > EXACT_WEIGHT).mean() > EXACT_PART
+    sure = hit[weight[hit] > EXACT_WEIGHT] if exact else hit[hit < SURE]
+    marks, first = np.unique(mark[sure], return_index=True)
+    return Ranked(pose, marks, near[sure[first]], len(hit))
 
 
 def seed_poses(candidates: Candidates, layout: Layout, guesses: Hypotheses) -> tuple[Array, Array]:

@@ -141,7 +141,7 @@ def identify(detections: Detections, pattern: Pattern, camera: Camera, hint: Hin
     _check_enough(detections, candidates, pattern)
     scene = scene_of(candidates, layout_of(pattern), camera)
     options: list[_Option] = []
-    copies = 0
+    sound: list[Embedding] = []
     least = FEWEST_MARKS
     for _ in range(MOST_COPIES):
         placement = find_placement(scene, least)
@@ -153,7 +153,7 @@ def identify(detections: Detections, pattern: Pattern, camera: Camera, hint: Hin
             raise IdentityError(problem)
         if not problem:
             options += found
-            copies += 1
+            sound.append(found[0].placement)
         least = max(least, int(np.ceil(COPY_PART * found[0].placement.count)))
         scene = rest_of(scene, found[0].placement)
     if not options:
@@ -161,9 +161,9 @@ def identify(detections: Detections, pattern: Pattern, camera: Camera, hint: Hin
             f"the pattern {pattern.name!r} was not found among {len(candidates)} circles that look like its marks; "
             "check that pattern and camera belong to this photograph and that several neighbouring targets are in view"
         )
-    chosen = _chosen([o for o in options if o.deficit < DECISIVE], hint, pattern, copies)
+    chosen = _chosen([o for o in options if o.deficit < DECISIVE], hint, pattern, len(sound))
     final = _settled(chosen)
-    problem = _problem(chosen.scene, pattern, final)
+    problem = None if any(final is placement for placement in sound) else _problem(chosen.scene, pattern, final)
     if problem:
         raise IdentityError(problem)
     others = [Alternative(o.pose, o.deficit) for o in options if o is not chosen]
@@ -181,7 +181,7 @@ def _check_enough(detections: Detections, candidates: Candidates, pattern: Patte
 
 def _options(scene: Scene, placement: Embedding, hint: Hint) -> list[_Option]:
     """The placement or a better rival of it first, then its rivals with their deficits against it."""
-    for _ in range(MOST_CHANGES):
+    for change in range(MOST_CHANGES + 1):
         seen = observe(scene, placement)
         prefer = partial(_about_agree, placement.fit.pose, hint)
         rivals = find_rivals(scene, placement, seen, prefer)
@@ -191,7 +191,7 @@ def _options(scene: Scene, placement: Embedding, hint: Hint) -> list[_Option]:
         clean = is_clean(scene.layout, placement)
         rough = [] if moved is not None or clean else _regrown(scene, placement, seen, rivals, order)
         moved = max([e for e in (moved, *rough) if e is not None], key=worth, default=None)
-        if moved is None or worth(moved) <= worth(placement):
+        if moved is None or worth(moved) <= worth(placement) or change == MOST_CHANGES:
             break
         placement = moved
     options = [_Option(scene, placement, placement.fit.pose, _pairs(placement), 0.0)]
@@ -201,9 +201,12 @@ def _options(scene: Scene, placement: Embedding, hint: Hint) -> list[_Option]:
     # those that the hint allows first: none of them may be overlooked
     allowed = prefer(rivals.rotation, rivals.shift_mm)
     kept = sorted(close, key=lambda h: not allowed[h])[:MOST_OPTIONS]
-    for h in kept + [h for h in exact if h not in close][:RULED_OUT_LISTED]:
+    for h in kept:
         option = _exact_option(scene, placement, seen, rivals, h, float(rivals.cost[h] - rivals.cost[0]))
         options += [option] if option is not None else []
+    for h in [h for h in exact if h not in close][:RULED_OUT_LISTED]:
+        pose = placement.fit.pose @ rivals.motion(h).inverse()
+        options.append(_Option(scene, placement, pose, _relabelled(seen, rivals, h), float(rivals.cost[h] - rivals.cost[0])))
     return _distinct(options, scene.layout)
 
 

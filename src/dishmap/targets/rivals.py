@@ -24,9 +24,9 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Index = NDArray[np.int64]
 
-# Motions are made from this many anchors, marks far from each other, and each one's matched neighbours; a neighbour's distance
-# may differ by this part.
-ANCHORS = 4
+# Motions are made from this many anchors, marks far from each other, and each one's nearest matched neighbour, whose distance
+# may differ by this part. A rival that matters leaves at most two observations over, so one anchor of three finds it.
+ANCHORS = 3
 PAIR_TOLERANCE = 0.15
 # A motion is looked at in full when it explains enough of a sample of this many matches: for a clean placement, all but some;
 # for another, which may owe matches to a bent surface, a small part.

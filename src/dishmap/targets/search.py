@@ -26,8 +26,9 @@ MEETS = 0.25
 # Seeds tried at most, and hypotheses grown.
 MOST_SEEDS = 30
 # Seeds looked at before any ambiguous one is grown; a clear one has a single hypothesis with so many votes.
-FIRST_SEEDS, CLEAR_VOTES = 3, 6
-FEWEST_SORTED = 12
+FIRST_SEEDS, CLEAR_VOTES = 2, 6
+# Hypotheses that are looked at further: this many times as many as agree about equally well, and at least so many.
+SORTED_PART, FEWEST_SORTED = 3, 24
 # Hypotheses agree about as well as the best when their misfit is below this many times the best one plus this much.
 CLEAR_MISFIT = (4.0, 0.002)
 MOST_GROWN = 15
@@ -132,10 +133,11 @@ def _clearest_first(scene: Scene) -> Iterator[Hypotheses]:
         guesses = match_neighbourhood(scene.candidates, int(seed), near, scene.layout)
         if not len(guesses.mark):
             continue
+        few = _clear_ones(guesses)
         if number >= FIRST_SEEDS or (guesses.votes[0] >= CLEAR_VOTES and _equally_good(guesses) == 1):
-            yield _clear_ones(guesses)
+            yield few
             continue
-        first.append(guesses)
+        first.append(few)
         if number == FIRST_SEEDS - 1:
             yield from sorted(first, key=_ambiguity)
             first = []
@@ -143,8 +145,8 @@ def _clearest_first(scene: Scene) -> Iterator[Hypotheses]:
 
 
 def _clear_ones(guesses: Hypotheses) -> Hypotheses:
-    """The hypotheses that agree best; all of them when many do."""
-    few = slice(0, max(2 * _equally_good(guesses), FEWEST_SORTED))
+    """The hypotheses that agree best; more of them when many agree about equally well."""
+    few = slice(0, max(SORTED_PART * _equally_good(guesses), FEWEST_SORTED))
     return Hypotheses(guesses.seed, guesses.mark[few], guesses.turn_rad[few], guesses.votes[few], guesses.misfit[few])
 
 
