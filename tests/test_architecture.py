@@ -28,18 +28,28 @@ ORDER = [
     *("surface.zernike",),
     # what is printed
     *("targets.pattern", "targets.symmetry", "targets.builders"),
+    # how a printed membrane moves
+    *("surface.membrane",),
     # finding it
     *("targets.ellipses", "targets.detect", "targets.subpixel"),
     # naming it
     *("targets.layout", "targets.rigid", "targets.markgrid", "targets.candidates", "targets.growth", "targets.constellations"),
     *("targets.beam", "targets.search", "targets.rivals", "targets.identify"),
     # measuring it in the raw pixels
-    *("targets.edges", "targets.pixels", "targets.window", "targets.adjust", "targets.start", "targets.sensitivity"),
-    *("targets.scene_noise", "targets.stages", "targets.pose"),
+    *("targets.edges", "targets.pixels", "targets.window", "targets.neighbours", "targets.adjust", "targets.start"),
+    *("targets.sensitivity", "targets.scene_noise", "targets.glare", "targets.stages", "targets.settle"),
+    *("targets.pose",),
     # measuring it as the paper does, and the limit of both
     *("targets.groups", "targets.paper", "targets.bound"),
     # the surface through the points
     *("surface.cloud", "surface.paraboloid", "surface.fit"),
+    # the difference between two photographs as the paper has it
+    *("difference.registration", "difference.ratio", "difference.levels", "difference.paper"),
+    # the rim that two photographs are compared against
+    *("difference.outline", "difference.profile", "difference.circle", "difference.rimfit", "difference.rim"),
+    # and as we have it: one estimate of everything that may have moved
+    *("difference.response", "difference.changes", "difference.priors", "difference.model", "difference.joint"),
+    *("difference.estimate", "difference.difference_map"),
     # photographs with truth
     *("simulate.deform", "simulate.scene", "simulate.forward", "simulate.truth", "simulate.contour", "simulate.render"),
     *("simulate.scenario",),
@@ -64,7 +74,16 @@ WALLS = {
     "click": ["cli"],
     "rich": ["cli"],
     # OpenCV stays where pixels are; geometry is ours, with Jacobians
-    "cv2": ["camera.undistort", "camera.chessboard", "targets.detect", "io.images", "io.camera_file", "io.picture_file", "plot"],
+    "cv2": [
+        "camera.undistort",
+        "camera.chessboard",
+        "targets.detect",
+        "io.images",
+        "io.camera_file",
+        "io.picture_file",
+        "plot",
+        "difference.outline",
+    ],
     # files that people write are checked where they are read
     "pydantic": ["io", "cli"],
     "pydantic_core": ["io"],

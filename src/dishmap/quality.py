@@ -26,6 +26,7 @@ class Quality(IntFlag):
     NOT_CONVERGED = 128
     WEAK_DEPTH = 256
     NO_CONTRAST = 512
+    OUTLIER = 1024
 
 
 MEANING: dict[Quality, str] = {
@@ -38,6 +39,7 @@ MEANING: dict[Quality, str] = {
     Quality.OFF_SURFACE: "the target lies far from the surface through its neighbours",
     Quality.NOT_CONVERGED: "the fit to the pixels did not converge",
     Quality.WEAK_DEPTH: "depth rests on the assumed ink spread (a lone disc), not on the image alone",
+    Quality.OUTLIER: "its change fits no smooth motion of the surface; the value is what its neighbours say",
     Quality.NO_CONTRAST: "too little contrast between ink and ground for a measurement",
 }
 

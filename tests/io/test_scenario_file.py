@@ -11,7 +11,7 @@ import pytest
 from dishmap.errors import CameraError, InputError
 from dishmap.io.scenario_file import KindName, parse_scenario, read_scenario
 from dishmap.simulate.scenario import Scenario, State, simulate_states
-from dishmap.simulate.scene import Disc, Polygon
+from dishmap.simulate.scene import Disc, Polygon, Ribs
 from dishmap.targets.builders import KIND_BUILDERS
 from dishmap.targets.pattern import Surface
 
@@ -34,6 +34,14 @@ tilt_direction_deg = 90
 noise_grey = 2.0
 [clutter]
 rings = 2
+[[ribs]]
+count = 8
+width_mm = 12
+inner_radius_mm = 50
+outer_radius_mm = 70
+grey = 60
+first_deg = 90
+front = false
 [[occluders]]
 center_px = [10, 20]
 radius_px = 5
@@ -67,6 +75,7 @@ def test_a_file_becomes_scenes() -> None:
     assert abs(ref.camera_from_dish.apply([50, 0, 0])[2] - 300) == pytest.approx(50 * np.sin(np.radians(20)))
     assert ref.sensor.noise_grey == 2.0
     assert len(ref.background) == 4
+    assert ref.ribs == (Ribs(8, 12.0, 50.0, 70.0, 60.0, np.pi / 2, front=False),)
     assert ref.occluders == (Disc((10.0, 20.0), 5.0, 0.0), Polygon(((0.0, 0.0), (9.0, 0.0), (0.0, 9.0)), 40.0))
     state = bent.deformation
     assert [(z.n, z.m, z.size_mm) for z in state.zernike] == [(2, 0, 0.3), (2, -2, 0.1)]
@@ -96,10 +105,13 @@ def test_the_example_is_valid_and_shows_every_key() -> None:
     text = EXAMPLE.read_text()
     # each commented line is valid too
     plate = text.replace("dish = {", "# dish = {").replace("# plate =", "plate =").replace("# glare", "glare")
+    for line in ("[[ribs]]", "count = 8", "width_mm", "inner_radius_mm", "outer_radius_mm", "grey = 60", "first_deg", "front = true"):
+        plate = plate.replace(f"# {line}", line)
     plate = plate.replace("# [[occ", "[[occ").replace("# corners", "corners").replace("# grey = 40", "grey = 40")
     scene = parse_scenario(plate).states[0].scene
     assert len(scene.pattern) == 30
     assert len(scene.light.glare) == 1
+    assert (scene.ribs[0].count, scene.ribs[0].front) == (8, True)
     assert len(scene.occluders) == 1
 
 
@@ -151,6 +163,8 @@ def test_kinds_are_those_of_the_builders() -> None:
         ("distance_mm = 300", "translation_mm = [0, 0, 300]", r"\[pose\] needs rotation_vector_deg together with translation_mm"),
         ("distance_mm = 300", "distance_mm = nan", "pose.distance_mm must be a finite number, not nan"),
         ("noise_grey = 2.0", "noise_grey = -2.0", "noise_grey must be zero or more, not -2.0"),
+        ("outer_radius_mm = 70", "outer_radius_mm = 40", "ribs run from inner_radius_mm out to outer_radius_mm, not 50.0 to 40.0"),
+        ("count = 8", "number = 8", r"unknown key 'number' in ribs\[0\]; the nearest valid one is"),
         ("radius_px = 5", "", "a shape of occluders needs either center_px and radius_px, or corners_px"),
         ("radius_px = 5", "radius_px = true", r"occluders\[0\].radius_px must be a valid number, not True"),
         ('term = "defocus"', 'term = "defokus"', "state 'bent': unknown Zernike term 'defokus'; the nearest name is 'defocus'"),

@@ -45,7 +45,7 @@ def test_fields_add_up() -> None:
 def test_points_grow_then_rise_towards_the_focus_then_move(x: float, y: float, size_mm: float, ppm: float) -> None:
     point = np.array([x, y, (x * x + y * y) / 1200])
     motion = Pose.from_rotation_vector([0.1, -0.2, 0.3], [5.0, 6.0, 7.0])
-    state = Deformation(zernike=(ZernikeTerm(0, 0, size_mm),), expansion_ppm=ppm, motion=motion)
+    state = Deformation(zernike=(ZernikeTerm(0, 0, size_mm),), expansion_ppm=ppm, slide="normal", motion=motion)
     moved = motion.inverse().apply(deform(state, DISH, point, 300.0))
     normal = np.array([-x / 600, -y / 600, 1.0])
     expected = point * (1 + ppm * 1e-6) + size_mm * normal / np.linalg.norm(normal)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -22,6 +24,7 @@ from dishmap.targets.edges import (
     edge_distance,
     local_maps,
     monomials,
+    plane_at_offsets,
     project_printed,
 )
 from dishmap.targets.pattern import bent_print_mm
@@ -42,7 +45,11 @@ MOTION_PART = 0.02
 # the square of the distance, by curvature and tilt and by the lens's change of scale (0.005 per px at the edge of WIDE).
 AT_EDGE_PX, NEAR_EDGE_PX, PER_SQUARE_PX = 0.25, 2.0, 0.006
 AT_EDGE_ERROR_PX = 4e-4
+# With the map's second derivatives the lens's third are left, and the part of the square that comes with the edge's own curvature.
+BENT_PER_SQUARE_PX, BENT_CURVATURE = 4e-4, 2.5e-4
 ROUNDING = 1e-9
+# Sums of ten terms in single precision.
+SINGLE = 2e-6
 
 VIEWS = {
     "axis": (PLAIN, (200.3, 150.2), 3000.0),
@@ -170,6 +177,19 @@ def test_motion_fields_follow_the_projection(view: str) -> None:
     assert (np.abs(field - motion[0]).max(axis=(0, 1)) < MOTION_PART * largest).all()
 
 
+def test_scales_and_bend_at_the_middle_of_a_patch() -> None:
+    camera, poses, scale = single("fisheye", 35.0)
+    patches = patch_of(camera, poses, FLAT, 12 * scale)
+    maps = local_maps(camera, poses, FLAT, patches)
+    jacobian, h = maps.plane[0, 2:, 0].reshape(2, 2), maps.second[0, :, 0]
+    np.testing.assert_allclose([x[0] for x in maps.mm_per_px], np.linalg.svd(jacobian, compute_uv=False))
+    # over one pixel in any direction the scale changes by no more than is said, and in some by a third of it at least
+    angle = np.linspace(0, 2 * np.pi, 100)
+    n = np.stack([np.cos(angle), np.sin(angle)])
+    change = np.linalg.norm(h.reshape(2, 3) @ [n[0] ** 2, 2 * n[0] * n[1], n[1] ** 2], axis=0) / np.linalg.norm(jacobian @ n, axis=0)
+    assert maps.bend_per_px[0] / 3 < change.max() < 1.42 * maps.bend_per_px[0]
+
+
 def test_motion_fields_are_taken_over_when_given() -> None:
     camera, poses, scale = single("axis", 20.0)
     patches = patch_of(camera, poses, FLAT, 12 * scale)
@@ -187,6 +207,31 @@ def test_a_patch_beyond_the_lens_has_infinite_misfit() -> None:
     maps = local_maps(camera, beyond, FLAT, patches)
     assert np.isinf(maps.misfit_px).all()
     assert np.isfinite(maps.plane).all()
+
+
+def test_a_target_that_a_bad_step_brought_beside_the_camera_has_finite_maps() -> None:
+    turn = rotation_from_vector(np.array([[0.4116305, 1.0425134, -0.1285347]]))
+    poses = Poses(turn, np.array([[134.1249, 161.7974, 7.4570]]))
+    # of its points few have an image, and these lie thousands of pixels out
+    patches = Patches(np.array([0]), np.zeros((1, 2)), np.array([34.0]), np.array([[395.0, 454.0]]), np.array([30.0]))
+    maps = local_maps(PLAIN, poses, FLAT, patches)
+    assert np.isinf(maps.misfit_px).all()
+    assert np.isfinite(maps.plane).all()
+    assert np.isfinite(maps.motion).all()
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_the_plane_at_common_offsets_is_that_of_each_patch(view: str) -> None:
+    camera, poses, scale = single(view, 30.0)
+    both = Poses(np.repeat(poses.rotation, 2, axis=0), np.repeat(poses.position_mm, 2, axis=0))
+    patches = patches_around(camera, both, np.repeat(FLAT, 2, axis=0), (np.zeros((2, 2)), scale * np.array([12.0, 20.0])), 0.85)
+    maps = local_maps(camera, both, np.repeat(FLAT, 2, axis=0), patches)
+    du, dv = np.random.default_rng(7).uniform(-10, 10, (2, 50))
+    rows = slice(1, 4)
+    six = plane_at_offsets(maps, patches, rows, du, dv)
+    shrink = patches.scale_px[rows, None]
+    expected = maps.plane[rows] @ monomials(du / shrink, dv / shrink, maps.degree)
+    np.testing.assert_allclose(six, expected, atol=SINGLE * np.abs(expected).max())
 
 
 @given(st.floats(0.1, 3), st.floats(-0.6, 0.6), st.floats(0.3, 1.0), st.floats(0, 6.3), st.floats(0.3, 1.7))
@@ -209,9 +254,19 @@ def test_edge_distance_leads_to_the_edge_where_the_map_is_affine(
     assert px_per_mm == pytest.approx(1 / np.linalg.norm(jacobian.T @ (start - center) / np.linalg.norm(start - center)))
 
 
-@pytest.mark.parametrize("view", VIEWS)
-@pytest.mark.parametrize("tilt_deg", [0.0, 30.0, 50.0])
-def test_edge_distance_against_the_nearest_point_of_the_projected_circle(view: str, tilt_deg: float) -> None:
+@dataclass(frozen=True)
+class Outline:
+    """Pixels (n,) near one projected circle: the model's six and second derivatives there, and what is true of the nearest edge point."""
+
+    six: Array
+    second: Array
+    radius_mm: Array
+    distance_px: Array
+    curvature_per_px: Array
+
+
+def traced(view: str, tilt_deg: float) -> Outline:
+    """A circle traced by 8000 exact projections; its curvature from three of them at a time."""
     camera, poses, scale = single(view, tilt_deg)
     radius = 12 * scale
     patches = patch_of(camera, poses, FLAT, radius)
@@ -221,17 +276,47 @@ def test_edge_distance_against_the_nearest_point_of_the_projected_circle(view: s
     edge = camera.project(poses.in_camera(bent_print_mm(circle[None], FLAT)))[0]
     s, t, pixels = in_patch(patches, np.random.default_rng(6), 1000)
     _, place = cKDTree(edge).query(pixels)
-    along = edge[(place + 1) % len(edge)] - edge[place - 1]
+    before, here, after = edge[place - 40], edge[place], edge[(place + 40) % len(edge)]
+    along = after - before
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    nearest = np.abs(along[:, 0] * (pixels - edge[place])[:, 1] - along[:, 1] * (pixels - edge[place])[:, 0])
+    gap = pixels - here
+    nearest = np.abs(along[:, 0] * gap[:, 1] - along[:, 1] * gap[:, 0])
     inside = np.linalg.norm(cut_with_plane(camera, poses, pixels), axis=1) < radius
-    true = np.where(inside, nearest, -nearest)
-    distance, *_ = edge_distance(maps.plane @ monomials(s, t, maps.degree), np.zeros((1, 2)), np.array([radius]))
-    error = np.abs(distance[0] - true)
+    one, two = here - before, after - here
+    area = np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0])
+    curvature = 2 * area / np.prod([np.linalg.norm(x, axis=1) for x in (one, two, after - before)], axis=0)
+    mono = monomials(s, t, maps.degree)
+    return Outline(maps.plane @ mono, maps.second @ mono, np.array([radius]), np.where(inside, nearest, -nearest), curvature)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("tilt_deg", [0.0, 30.0, 50.0])
+def test_edge_distance_against_the_nearest_point_of_the_projected_circle(view: str, tilt_deg: float) -> None:
+    edge = traced(view, tilt_deg)
+    distance, *_ = edge_distance(edge.six, np.zeros((1, 2)), edge.radius_mm)
+    error, nearest = np.abs(distance[0] - edge.distance_px), np.abs(edge.distance_px)
     at, near = nearest < AT_EDGE_PX, nearest < NEAR_EDGE_PX
     assert at.sum() > 10
     assert error[at].max() < AT_EDGE_ERROR_PX
     assert (error[near] < AT_EDGE_ERROR_PX + PER_SQUARE_PX * nearest[near] ** 2).all()
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("tilt_deg", [0.0, 30.0])
+def test_second_derivatives_give_distance_and_curvature_through_a_wide_lens(view: str, tilt_deg: float) -> None:
+    edge = traced(view, tilt_deg)
+    nearest = np.abs(edge.distance_px)
+    at, near = nearest < AT_EDGE_PX, nearest < NEAR_EDGE_PX
+    worst = []
+    for second in (edge.second, None):
+        distance, _, _, _, curvature = edge_distance(edge.six, np.zeros((1, 2)), edge.radius_mm, second)
+        away = np.abs(distance[0] - edge.distance_px)[near] / np.maximum(nearest[near], AT_EDGE_PX) ** 2
+        worst.append((away.max(), np.abs(curvature[0] - edge.curvature_per_px)[at].max()))
+    assert worst[0][0] < BENT_PER_SQUARE_PX
+    assert worst[0][1] < BENT_CURVATURE
+    if view != "axis":
+        assert worst[1][0] > 2 * worst[0][0]
+        assert worst[1][1] > 2 * BENT_CURVATURE
 
 
 @pytest.mark.parametrize(("radius_px", "tilt_deg"), [(8.0, 0.0), (8.0, 40.0), (30.0, 60.0)])

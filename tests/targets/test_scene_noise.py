@@ -1,4 +1,4 @@
-"""The noise of a photograph from residuals: white, growing with light, correlated, with outliers."""
+"""The noise of a photograph from residuals: white, growing with light, correlated, with outliers. The spread of normals from tilts."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from dishmap.targets.scene_noise import NoiseModel, noise_model
+from dishmap.targets.scene_noise import LEAST_NORMAL_SIGMA_RAD, NoiseModel, noise_model, normal_spread
 
 Array = NDArray[np.float64]
 
@@ -111,3 +111,50 @@ def test_a_handful_of_pixels_is_enough_for_a_number() -> None:
     assert noise.slope == 0
     assert 0.1 < noise.base < 5
     assert noise.inflation == 1
+
+
+WIDEST_RAD = np.radians(12.0)
+
+
+def shrunk(spread_deg: float, data_deg: float, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Errors (count, 2) of tilts held by the spread that is learnt from all of them, over their claimed sigmas; and the sigmas, rad."""
+    true = np.radians(spread_deg) * rng.standard_normal((count, 2))
+    seen = true + np.radians(data_deg) * rng.standard_normal((count, 2))
+    variance = np.radians(data_deg) ** 2
+    prior = normal_spread(seen, np.tile(variance * np.eye(2), (count, 1, 1)), WIDEST_RAD) ** 2
+    sigma = np.sqrt(prior * variance / (prior + variance))
+    return (prior / (prior + variance) * seen - true) / sigma, np.broadcast_to(sigma, true.shape)
+
+
+@pytest.mark.parametrize("count", [6, 30, 130])
+@pytest.mark.parametrize("spread_deg", [0.03, 0.1, 0.2, 0.3, 1.0])
+def test_a_spread_below_what_tilts_show_is_not_taken_for_none(spread_deg: float, count: int) -> None:
+    """The likeliest spread is often nothing where 0.1 degrees are hidden in 0.3 of noise: normals would be off by 5 claimed sigma."""
+    rng = np.random.default_rng([count, int(100 * spread_deg)])
+    score = np.concatenate([shrunk(spread_deg, 0.3, count, rng)[0] for _ in range(1200 // count)])
+    # 2400 scores: five standard errors of a rms are 7 %; whole photographs in which little was learnt share the rest
+    assert np.sqrt((score**2).mean()) < 1.25
+    assert np.abs(score).max() < 7
+
+
+@pytest.mark.parametrize(("count", "most"), [(6, 0.6), (30, 0.4), (130, 0.3)])
+def test_exact_normals_help_the_more_the_more_targets_say_so(count: int, most: float) -> None:
+    rng = np.random.default_rng(count)
+    sigma = np.concatenate([shrunk(0.0, 0.3, count, rng)[1] for _ in range(20)])
+    # of 0.3 degrees that each knows alone
+    assert np.degrees(np.sqrt((sigma**2).mean())) < most * 0.3
+
+
+def test_a_spread_that_shows_is_what_it_is() -> None:
+    rng = np.random.default_rng(1)
+    tilt = np.radians(0.5) * rng.standard_normal((200, 2))
+    spread = normal_spread(tilt, np.tile(np.radians(0.02) ** 2 * np.eye(2), (200, 1, 1)), WIDEST_RAD)
+    # a standard deviation from 400 values is known to 3.5 %
+    assert np.degrees(spread) == pytest.approx(0.5, rel=0.12)
+    bent = tilt.copy()
+    bent[0] = np.radians(15.0)
+    assert normal_spread(bent, np.tile(np.radians(0.02) ** 2 * np.eye(2), (200, 1, 1)), WIDEST_RAD) == pytest.approx(spread, rel=0.1)
+    # too few to learn from, and nothing to learn
+    assert normal_spread(tilt[:3], np.tile(1e-8 * np.eye(2), (3, 1, 1)), WIDEST_RAD) == WIDEST_RAD
+    none = normal_spread(np.zeros((200, 2)), np.tile(1e-12 * np.eye(2), (200, 1, 1)), WIDEST_RAD)
+    assert none == pytest.approx(LEAST_NORMAL_SIGMA_RAD, rel=0.2)

@@ -23,7 +23,7 @@ from dishmap.io.camera_file import read_camera
 from dishmap.io.pattern_file import read_pattern
 from dishmap.simulate.deform import Bump, Crease, Deformation, Gores, ZernikeTerm
 from dishmap.simulate.scenario import Scenario, State
-from dishmap.simulate.scene import Disc, Glare, Light, Polygon, Scene, Sensor, Shape, facing_pose, random_shapes
+from dishmap.simulate.scene import Disc, Glare, Light, Polygon, Ribs, Scene, Sensor, Shape, facing_pose, random_shapes
 from dishmap.surface.zernike import parse_term
 from dishmap.targets.builders import KIND_BUILDERS, dish, plate
 from dishmap.targets.pattern import Pattern, TargetKind
@@ -134,6 +134,18 @@ class PrintModel(_Model):
     margin_mm: float = Scene.margin_mm
 
 
+class RibsModel(_Model):
+    """Evenly spaced struts over the rim, as `dishmap.simulate.scene.Ribs`."""
+
+    count: Annotated[int, Field(le=1000)]
+    width_mm: float
+    inner_radius_mm: float
+    outer_radius_mm: float
+    grey: float
+    first_deg: float = 0.0
+    front: bool = Ribs.front
+
+
 class ShapeModel(_Model):
     """A disc (center_px, radius_px) or a polygon (corners_px) in the image plane."""
 
@@ -202,6 +214,7 @@ class StateModel(_Model):
     creases: list[CreaseModel] = []
     gores: list[GoresModel] = []
     expansion_ppm: float = 0.0
+    slide: Literal["least_strain", "normal"] = "least_strain"
     motion: MotionModel = MotionModel()
 
 
@@ -217,6 +230,7 @@ class ScenarioModel(_Model):
     light: LightModel = LightModel()
     sensor: SensorModel = SensorModel()
     print: PrintModel = PrintModel()
+    ribs: list[RibsModel] = []
     clutter: ClutterModel = ClutterModel()
     background: list[ShapeModel] = []
     occluders: list[ShapeModel] = []
@@ -269,6 +283,7 @@ def _scenario(model: ScenarioModel, folder: Path) -> Scenario:
         sensor=Sensor(**model.sensor.model_dump()),
         ink_spread_mm=model.print.ink_spread_mm,
         margin_mm=model.print.margin_mm,
+        ribs=tuple(_ribs(ribs) for ribs in model.ribs),
         background=(*shapes, *(_shape(shape, "background") for shape in model.background)),
         occluders=tuple(_shape(shape, "occluders") for shape in model.occluders),
     )
@@ -331,6 +346,10 @@ def _light(model: LightModel) -> Light:
     return Light(model.ink_grey, model.ground_grey, model.background_grey, _pair(model.gradient), model.vignetting, glare)
 
 
+def _ribs(model: RibsModel) -> Ribs:
+    return Ribs(**model.model_dump(exclude={"first_deg"}), first_rad=float(np.radians(model.first_deg)))
+
+
 def _shape(model: ShapeModel, where: str) -> Shape:
     if model.corners_px is not None and model.center_px is None and model.radius_px is None:
         return Polygon(tuple(_pair(corner) for corner in model.corners_px), model.grey)
@@ -347,6 +366,7 @@ def _state(scene: Scene, model: StateModel) -> State:
             creases=tuple(Crease(_pair(c.point_mm), float(np.radians(c.direction_deg)), c.sigma_mm, c.height_mm) for c in model.creases),
             gores=tuple(Gores(g.count, g.depth_mm) for g in model.gores),
             expansion_ppm=model.expansion_ppm,
+            slide=model.slide,
             motion=Pose.from_rotation_vector(np.radians(model.motion.rotation_vector_deg), model.motion.translation_mm),
         )
     except InputError as error:

@@ -5,12 +5,14 @@ Pixels and truth both come from here.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dishmap.camera.model import Camera
-from dishmap.simulate.deform import deform, displacement_mm
-from dishmap.simulate.scene import Scene
+from dishmap.simulate.deform import Deformation, deform, displacement_mm
+from dishmap.simulate.scene import Ribs, Scene
 from dishmap.targets.pattern import bent_print_mm
 
 Array = NDArray[np.float64]
@@ -86,6 +88,25 @@ def outline_px(scene: Scene) -> Array:
     return _outline_at(scene, np.arange(count) / count)
 
 
+def rib_outlines_px(scene: Scene, ribs: Ribs) -> list[Array]:
+    """Outlines of ribs in the image: closed polylines (K, 2) with steps of half a pixel.
+
+    Beyond the rim a rib goes on as the nominal surface would, moved as the rim beside it is: a deformation means nothing there.
+    """
+    # counter-clockwise about the boresight, as the surface's outline
+    across = np.array([-0.5, -0.5, 0.5, 0.5, -0.5]) * ribs.width_mm
+    along = np.array([0.0, 1.0, 1.0, 0.0, 0.0]) * (ribs.outer_radius_mm - ribs.inner_radius_mm) + ribs.inner_radius_mm
+    outlines = []
+    for angle in ribs.first_rad + 2 * np.pi * np.arange(ribs.count) / ribs.count:
+        out, side = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+        corners = along[:, None] * out + across[:, None] * side
+        ends = _rib_px(scene, corners)
+        cuts = np.clip(np.linalg.norm(np.diff(ends, axis=0), axis=1) / OUTLINE_STEP_PX, 8, OUTLINE_LONGEST).astype(np.int64)
+        steps = [a + (b - a) * (np.arange(n) / n)[:, None] for a, b, n in zip(corners[:-1], corners[1:], cuts, strict=True)]
+        outlines.append(_rib_px(scene, np.concatenate(steps)))
+    return outlines
+
+
 def _outline_at(scene: Scene, t: Array) -> Array:
     """Outline (K, 2) in pixels at parameters (K,) from 0 to 1."""
     pattern = scene.pattern
@@ -94,9 +115,28 @@ def _outline_at(scene: Scene, t: Array) -> Array:
     else:
         radius = rim_radius_mm(scene) + (scene.margin_mm if pattern.surface.diameter_mm is None else 0.0)
         xy = radius * np.stack([np.cos(2 * np.pi * t), np.sin(2 * np.pi * t)], axis=-1)
-    nominal = np.concatenate([xy, pattern.surface.height_mm(xy)[..., None]], axis=-1)
-    points = scene.camera_from_dish.apply(deform(scene.deformation, pattern.surface, nominal, rim_radius_mm(scene)))
-    return scene.camera.project(_drawn_in(scene.camera, points))
+    return _surface_px(scene, xy)
+
+
+def _surface_px(scene: Scene, xy_mm: Array) -> Array:
+    """Image (K, 2) of points of the surface at nominal positions (K, 2)."""
+    return scene.camera.project(_drawn_in(scene.camera, _surface_points(scene, xy_mm)))
+
+
+def _rib_px(scene: Scene, xy_mm: Array) -> Array:
+    """Image (K, 2) of points of ribs at nominal positions (K, 2), on the surface or beyond its rim."""
+    radius = rim_radius_mm(scene)
+    inner = xy_mm * np.minimum(1.0, radius / np.maximum(np.linalg.norm(xy_mm, axis=1), 1e-9))[:, None]
+    rigid = replace(scene, deformation=Deformation(expansion_ppm=scene.deformation.expansion_ppm, motion=scene.deformation.motion))
+    moved = _surface_points(scene, inner) - _surface_points(rigid, inner)
+    return scene.camera.project(_drawn_in(scene.camera, _surface_points(rigid, xy_mm) + moved))
+
+
+def _surface_points(scene: Scene, xy_mm: Array) -> Array:
+    """Points (K, 3) in the camera frame of the surface at nominal positions (K, 2)."""
+    surface = scene.pattern.surface
+    nominal = np.concatenate([xy_mm, surface.height_mm(xy_mm)[..., None]], axis=-1)
+    return scene.camera_from_dish.apply(deform(scene.deformation, surface, nominal, rim_radius_mm(scene)))
 
 
 def _rectangle(scene: Scene, t: Array) -> Array:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 
 from dishmap.simulate.contour import STEP_SIGMAS, add_curve, circle, finish, polyline, reach_px, signed_area, spectral_dv
-from dishmap.simulate.forward import facing, outline_px, printed_points
+from dishmap.simulate.forward import facing, outline_px, printed_points, rib_outlines_px
 from dishmap.simulate.scene import FULL_SCALE_GREY, Disc, Scene, Sensor, Shape, spread_radius_mm
 from dishmap.simulate.truth import Simulation, Truth, truth_of
 
@@ -64,9 +64,11 @@ def render_light(scene: Scene) -> tuple[Grey, Truth]:
         patch = _shape_patch(shape, size, scene.sensor.psf_sigma_px)
         if patch is not None:
             _paint(light, patch, shape.grey)
+    _ribs(light, scene, front=False)
     inks = _print(light, scene)
+    hidden = _ribs(light, scene, front=True)
     _shade(light, scene)
-    hidden = _occlude(light, scene)
+    hidden = _occlude(light, scene, hidden)
     visible = np.zeros(len(scene.pattern))
     for ink in inks:
         clear = ink.patch.of(light) < FULL_SCALE_GREY
@@ -189,11 +191,32 @@ def _shade(light: Grey, scene: Scene) -> None:
             light[band] += (spot.peak_grey * up[band, None] * along).astype(np.float32)
 
 
-def _occlude(light: Grey, scene: Scene) -> Grey | None:
-    """Paint the occluders over the light, and return how much of each pixel they hide, None when there are none."""
-    if not scene.occluders:
+def _ribs(light: Grey, scene: Scene, front: bool) -> Grey | None:
+    """Paint the ribs in front of the surface, or those behind it, and return how much of each pixel they hide, None without ribs.
+
+    As of the surface, nothing is drawn of ribs whose back is seen.
+    """
+    chosen = [ribs for ribs in scene.ribs if ribs.front == front]
+    if not chosen:
         return None
     hidden = np.zeros_like(light)
+    for ribs in chosen:
+        for corners in rib_outlines_px(scene, ribs):
+            points, dv = polyline(corners, scene.sensor.psf_sigma_px)
+            if signed_area(points, dv) >= 0:
+                continue
+            patch = _region(points, -dv, light.shape, scene.sensor.psf_sigma_px)
+            if patch is not None:
+                _paint(light, patch, ribs.grey)
+                _paint(hidden, patch, 1.0)
+    return hidden
+
+
+def _occlude(light: Grey, scene: Scene, hidden: Grey | None) -> Grey | None:
+    """Paint the occluders over the light; return how much of each pixel they and what was `hidden` before hide, None for nothing."""
+    if not scene.occluders:
+        return hidden
+    hidden = np.zeros_like(light) if hidden is None else hidden
     for shape in scene.occluders:
         patch = _shape_patch(shape, light.shape, scene.sensor.psf_sigma_px)
         if patch is not None:

@@ -96,6 +96,33 @@ class Light:
 
 
 @dataclass(frozen=True)
+class Ribs:
+    """`count` straight struts, evenly spaced, that run outwards over the dish's rim.
+
+    Each is `width_mm` wide and reaches from `inner_radius_mm` to `outer_radius_mm` (both seen along the boresight), the first
+    towards `first_rad` from x. They lie on the nominal surface, carried on beyond its rim, and move with it.
+    front: the ribs hide surface and ink; otherwise they stand behind the surface and show beyond its rim only.
+    """
+
+    count: int
+    width_mm: float
+    inner_radius_mm: float
+    outer_radius_mm: float
+    grey: float
+    first_rad: float = 0.0
+    front: bool = True
+
+    def __post_init__(self) -> None:
+        if self.count < 1:
+            raise InputError(f"ribs need a count of at least 1, not {self.count}")
+        if not (np.isfinite(self.width_mm) and self.width_mm > 0 and np.isfinite(self.first_rad)):
+            raise InputError(f"ribs need a positive width_mm and a finite first_rad, not {self.width_mm} and {self.first_rad}")
+        if not 0 <= self.inner_radius_mm < self.outer_radius_mm < np.inf:
+            raise InputError(f"ribs run from inner_radius_mm out to outer_radius_mm, not {self.inner_radius_mm} to {self.outer_radius_mm}")
+        _check_grey("ribs", self.grey)
+
+
+@dataclass(frozen=True)
 class Sensor:
     """Blur, tone curve, noise and quantisation.
 
@@ -128,7 +155,8 @@ class Scene:
     """One photograph to be made.
 
     ink_spread_mm: every dark area grows by this much at its edges. margin_mm: ground beyond the outermost ink of a
-    pattern that has no rim. background: shapes behind the dish, painted in order; occluders: shapes in front of it.
+    pattern that has no rim. ribs: struts that cross the rim. background: shapes behind the dish and its ribs, painted in
+    order; occluders: shapes in front of it.
     """
 
     pattern: Pattern
@@ -139,10 +167,12 @@ class Scene:
     sensor: Sensor = field(default_factory=Sensor)
     ink_spread_mm: float = 0.0
     margin_mm: float = 20.0
+    ribs: tuple[Ribs, ...] = ()
     background: tuple[Shape, ...] = ()
     occluders: tuple[Shape, ...] = ()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "ribs", tuple(self.ribs))
         object.__setattr__(self, "background", tuple(self.background))
         object.__setattr__(self, "occluders", tuple(self.occluders))
         if not (np.isfinite(self.margin_mm) and self.margin_mm >= 0):

@@ -4,6 +4,10 @@ The threshold of a pixel is half way between the darkest and the lightest pixel 
 shading of any strength and needs no idea of a circle's size: only the neighbourhood of edges is ever told apart, and a
 large disc shows as the contour of its edge. A contour that does not follow an edge is dropped point by point, when it
 is moved to the crossing of the threshold between two pixels.
+
+Blur fills narrow gaps and small holes to beyond that threshold: small circles run together and lose their holes. Where
+contours are small or no ellipses, a second threshold is tried, the mean of a few pixels around. It follows the sign of the
+curvature of the grey levels, which parts two edges as long as there is any dip between them.
 """
 
 from __future__ import annotations
@@ -40,6 +44,12 @@ HALVE_ABOVE_PX = 6_000_000
 # more than the given part of its circles, or of its contours of one blob each, is that small.
 COARSE_PX = 4.0
 COARSE_PART = 0.2
+# Search by the local mean: smoothing of the image and of the mean (sigmas in px); contrast in sigmas of the noise before smoothing
+# (which leaves 0.28 of it); how far pixels see each other.
+MEAN_SMOOTH_PX, MEAN_PX, MEAN_CONTRAST_SIGMAS, MEAN_MARGIN_PX = 1.0, 2.2, 2.4, 12
+# It is made in bands that hold dark, or light, ellipses of a smaller half axis than this, or a contour of no ellipse that is not
+# wider than circles that run together are (area over length of its outline); it gives ellipses up to the last half axis.
+CLOSE_BELOW_PX, CLOSE_BELOW_LIGHT_PX, CLUMP_WIDTH_PX, CLOSE_UP_TO_PX = 10.0, 5.0, 14.0, 14.0
 # A second, coarser search finds large circles with ragged edges.
 SECOND_REDUCTION = 4
 # Contours: fewest points; the largest spread (see `contour_spread`), to which each pixel of a small contour adds; and the
@@ -50,9 +60,12 @@ LEAST_GOOD_POINTS = 0.6
 SMALLEST_SEMI_AXIS_PX = 1.2
 LEAST_AXIS_RATIO = 0.2
 RMS_PX, RMS_PART = 0.12, 0.03
+# The first numbers for the search by the local mean: a tilted circle blurred by half of its small axis is lens-shaped.
+LARGEST_SPREAD_BY_MEAN, RMS_PX_BY_MEAN = (0.22, 2.2), 0.22
 AREA_TOLERANCE = 0.2
-# Two finds are the same circle when the centres agree to this many px of the coarser one and the sizes to this part.
-SAME_CENTER_PX, SAME_SIZE = 1.5, 0.1
+# Two finds are the same circle when the centres agree to this many px of the coarser one and the sizes to this part; by the local
+# mean, blurred rings are larger and their holes smaller.
+SAME_CENTER_PX, SAME_SIZE, SAME_SIZE_BY_MEAN = 1.5, 0.1, 0.3
 
 
 @dataclass(frozen=True)
@@ -92,13 +105,13 @@ def find_ellipses(gray: NDArray[Any], full_resolution: bool = False) -> Detectio
     base = 2 if halve else 1
     image = _reduced(gray, base, white)
     noise = _noise(image)
-    found, small = _search(image, base, noise)
+    found, small = _search_closely(image, base, noise)
     if halve and _too_coarse(found, base, small):
-        found, _ = _search(_reduced(gray, 1, white), 1, noise * 2)
+        found, _ = _search_closely(_reduced(gray, 1, white), 1, noise * 2)
     if min(image.shape) >= 16 * SECOND_REDUCTION:
         second = 2 * SECOND_REDUCTION if halve else SECOND_REDUCTION
-        coarse, _ = _search(_reduced(image, SECOND_REDUCTION, 255.0), second, noise / SECOND_REDUCTION)
-        found = _merged(found, coarse)
+        coarse, *_ = _search(_reduced(image, SECOND_REDUCTION, 255.0), second, noise / SECOND_REDUCTION)
+        found = _merged(found, coarse, SAME_SIZE)
     return _detections(found, white / 255.0)
 
 
@@ -145,33 +158,69 @@ def _noise(image: Image) -> float:
     return float(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0))
 
 
-def _search(image: Image, reduction: int, noise: float) -> tuple[_Found, int]:
-    """All ellipses of one image; also how many small blobs its contours hold."""
+def _search_closely(image: Image, reduction: int, noise: float) -> tuple[_Found, int]:
+    """All ellipses of one image, those that run together too; also how many small blobs its contours hold."""
+    found, small, unclear = _search(image, reduction, noise)
+    fine = found.semi_axes[:, 1] < np.where(found.dark, CLOSE_BELOW_PX, CLOSE_BELOW_LIGHT_PX) * reduction
+    v, reach = found.center[fine, 1] / reduction, found.semi_axes[fine, 0] / reduction
+    rows = np.concatenate([unclear, np.column_stack([v - reach, v + reach])])
+    bands = [(top, bottom) for top, bottom in _bands(len(image)) if ((rows[:, 0] < bottom) & (rows[:, 1] >= top)).any()]
+    if not bands:
+        return found, small
+    return _merged(found, _search_by_mean(image, reduction, noise, bands), SAME_SIZE_BY_MEAN), small
+
+
+def _search(image: Image, reduction: int, noise: float) -> tuple[_Found, int, Array]:
+    """All ellipses of one image; how many small blobs its contours hold; first and last rows (U, 2) of clumps that are no ellipse."""
     if noise > SMOOTH_ABOVE_NOISE:
         image, noise = np.asarray(cv2.GaussianBlur(image, (3, 3), 0), dtype=np.uint8), noise / 2.5
     threshold, ink = _binarise(image, min(max(LEAST_CONTRAST, LEAST_CONTRAST_SIGMAS * noise), 255.0))
     outlines, _ = cv2.findContours(ink, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     small = sum(1 for c in outlines if 4 <= len(c) < FEWEST_POINTS)
     contours = [np.asarray(c, dtype=np.int32) for c in outlines if len(c) >= FEWEST_POINTS]
-    if not contours:
-        return _nothing(), small
-    return _ellipses(image, threshold, contours, reduction), small
+    found, which = _ellipses(image, threshold, contours, reduction, LARGEST_SPREAD, RMS_PX)
+    rest = [contours[i] for i in np.setdiff1d(np.arange(len(contours)), which)]
+    rows = [(c[:, 0, 1].min(), c[:, 0, 1].max()) for c in rest if cv2.contourArea(c) <= CLUMP_WIDTH_PX * len(c)]
+    return found, small, np.array(rows, dtype=float).reshape(-1, 2)
+
+
+def _search_by_mean(image: Image, reduction: int, noise: float, bands: list[tuple[int, int]]) -> _Found:
+    """Small ellipses in bands of rows of one image, whose threshold is the mean of a few pixels around."""
+    least_contrast = min(max(LEAST_CONTRAST, MEAN_CONTRAST_SIGMAS * noise), 255.0)
+    smooth, mean, ink = image.copy(), np.zeros_like(image), np.zeros_like(image)
+    for top, bottom in bands:
+        first, last = max(0, top - MEAN_MARGIN_PX), min(len(image), bottom + MEAN_MARGIN_PX)
+        inner = slice(top - first, bottom - first)
+        part = np.asarray(cv2.GaussianBlur(image[first:last], (0, 0), MEAN_SMOOTH_PX), dtype=np.uint8)
+        smooth[top:bottom] = part[inner]
+        mean[top:bottom] = cv2.GaussianBlur(image[first:last], (0, 0), MEAN_PX)[inner]
+        edges = _edges(part, least_contrast)[2][inner]
+        cv2.bitwise_and(cv2.compare(smooth[top:bottom], mean[top:bottom], cv2.CMP_LT), edges, dst=ink[top:bottom])
+    outlines, _ = cv2.findContours(ink, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    contours = [np.asarray(c, dtype=np.int32) for c in outlines if len(c) >= FEWEST_POINTS]
+    found, _ = _ellipses(smooth, mean, contours, reduction, LARGEST_SPREAD_BY_MEAN, RMS_PX_BY_MEAN)
+    return found.take(np.flatnonzero((found.contrast >= least_contrast) & (found.semi_axes[:, 0] <= CLOSE_UP_TO_PX * reduction)))
 
 
 def _binarise(image: Image, least_contrast: float) -> tuple[Image, Image]:
     """Threshold of each pixel, and where the image is ink (255)."""
     threshold, ink = np.empty_like(image), np.empty_like(image)
-    kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * WINDOW_PX + 1, 2 * WINDOW_PX + 1))
     for top, bottom in _bands(len(image)):
         first, last = max(0, top - WINDOW_PX), min(len(image), bottom + WINDOW_PX)
         inner = slice(top - first, bottom - first)
-        low, high = (f(image[first:last], kernel)[inner] for f in (cv2.erode, cv2.dilate))
+        low, high, edges = (part[inner] for part in _edges(image[first:last], least_contrast))
         cv2.addWeighted(low, 0.5, high, 0.5, 0.0, dst=threshold[top:bottom])
-        # contrast of the window against its own limit: high - low > max(least, part * high)
-        limit = np.maximum(cv2.convertScaleAbs(high, alpha=LEAST_RELATIVE_CONTRAST), np.uint8(least_contrast))
-        edges = cv2.compare(cv2.subtract(high, low), limit, cv2.CMP_GT)
         cv2.bitwise_and(cv2.compare(image[top:bottom], threshold[top:bottom], cv2.CMP_LT), edges, dst=ink[top:bottom])
     return threshold, ink
+
+
+def _edges(image: Image, least_contrast: float) -> tuple[Image, Image, Image]:
+    """Darkest and lightest pixel of the window around each pixel, and where these are far enough apart for an edge (255)."""
+    kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * WINDOW_PX + 1, 2 * WINDOW_PX + 1))
+    low, high = (np.asarray(f(image, kernel), dtype=np.uint8) for f in (cv2.erode, cv2.dilate))
+    # contrast of the window against its own limit: high - low > max(least, part * high)
+    limit = np.maximum(cv2.convertScaleAbs(high, alpha=LEAST_RELATIVE_CONTRAST), np.uint8(least_contrast))
+    return low, high, np.asarray(cv2.compare(cv2.subtract(high, low), limit, cv2.CMP_GT), dtype=np.uint8)
 
 
 def _bands(rows: int) -> Iterator[tuple[int, int]]:
@@ -179,14 +228,18 @@ def _bands(rows: int) -> Iterator[tuple[int, int]]:
         yield top, min(rows, top + BAND_ROWS)
 
 
-def _ellipses(image: Image, threshold: Image, contours: list[NDArray[np.int32]], reduction: int) -> _Found:
-    """Ellipses of the contours that pass all tests, in full-resolution pixels."""
+def _ellipses(
+    image: Image, threshold: Image, contours: list[NDArray[np.int32]], reduction: int, largest_spread: tuple[float, float], rms_px: float
+) -> tuple[_Found, NDArray[np.int64]]:
+    """Ellipses of the contours that pass all tests, in full-resolution pixels, and which contours these are."""
+    if not contours:
+        return _nothing(), np.zeros(0, dtype=np.int64)
     points, starts = _concatenated(contours)
     counts = np.diff(np.append(starts, len(points)))
-    keep = contour_spread(points, starts) < LARGEST_SPREAD[0] + LARGEST_SPREAD[1] / counts
-    if not keep.any():
-        return _nothing()
-    points, starts = _concatenated([c for c, k in zip(contours, keep, strict=True) if k])
+    which = np.flatnonzero(contour_spread(points, starts) < largest_spread[0] + largest_spread[1] / counts)
+    if not len(which):
+        return _nothing(), which
+    points, starts = _concatenated([contours[i] for i in which])
     counts = np.diff(np.append(starts, len(points)))
     # OpenCV runs around ink one way and around holes in it the other way
     dark = _signed_area(points, starts, counts) > 0
@@ -198,7 +251,7 @@ def _ellipses(image: Image, threshold: Image, contours: list[NDArray[np.int32]],
     fits = fit_ellipses(moved, starts, weights)
     contrast_mean = np.add.reduceat(contrast * weights, starts) / np.maximum(np.add.reduceat(weights, starts), 1.0)
     with np.errstate(invalid="ignore"):
-        keep = enough & _is_ellipse(fits, np.abs(_signed_area(moved, starts, counts)))
+        keep = enough & _is_ellipse(fits, np.abs(_signed_area(moved, starts, counts)), rms_px)
     found = _Found(
         fits.center * reduction + (reduction - 1) / 2,
         fits.semi_axes * reduction,
@@ -208,7 +261,7 @@ def _ellipses(image: Image, threshold: Image, contours: list[NDArray[np.int32]],
         fits.rms * reduction,
         np.full(len(starts), float(reduction)),
     )
-    return found.take(np.flatnonzero(keep))
+    return found.take(np.flatnonzero(keep)), which[keep]
 
 
 def _concatenated(contours: list[NDArray[np.int32]]) -> tuple[Array, NDArray[np.int64]]:
@@ -216,12 +269,12 @@ def _concatenated(contours: list[NDArray[np.int32]]) -> tuple[Array, NDArray[np.
     return points, np.cumsum([0] + [len(c) for c in contours[:-1]])
 
 
-def _is_ellipse(fits: Fits, area: Array) -> NDArray[np.bool_]:
+def _is_ellipse(fits: Fits, area: Array, rms_px: float) -> NDArray[np.bool_]:
     major, minor = fits.semi_axes.T
     return np.asarray(
         (minor >= SMALLEST_SEMI_AXIS_PX)
         & (minor >= LEAST_AXIS_RATIO * major)
-        & (fits.rms <= RMS_PX + RMS_PART * np.sqrt(major * minor))
+        & (fits.rms <= rms_px + RMS_PART * np.sqrt(major * minor))
         & (np.abs(area / (np.pi * major * minor) - 1) <= AREA_TOLERANCE)
     )
 
@@ -275,14 +328,14 @@ def _too_coarse(found: _Found, reduction: int, small_blobs: int) -> bool:
     return not dark.any() or small > COARSE_PART * dark.sum() or small_blobs > dark.sum() / COARSE_PART
 
 
-def _merged(fine: _Found, coarse: _Found) -> _Found:
-    """Both sets, without those of the coarse search that the fine one has."""
+def _merged(fine: _Found, coarse: _Found, same_size: float) -> _Found:
+    """Both sets, without those of the second search that the first one has with sizes to this part."""
     from scipy.spatial import cKDTree
 
     if not len(coarse.center) or not len(fine.center):
         return fine if not len(coarse.center) else coarse
     tolerance = SAME_CENTER_PX * coarse.reduction[0]
-    a, b = (np.column_stack([f.center, np.log(f.semi_axes.prod(axis=1)) / 2 * tolerance / SAME_SIZE]) for f in (fine, coarse))
+    a, b = (np.column_stack([f.center, np.log(f.semi_axes.prod(axis=1)) / 2 * tolerance / same_size]) for f in (fine, coarse))
     distance, _ = cKDTree(np.column_stack([a, 1e9 * fine.dark])).query(np.column_stack([b, 1e9 * coarse.dark]), p=np.inf)
     new = coarse.take(np.flatnonzero(distance > tolerance))
     return _Found(*(np.concatenate([getattr(fine, n), getattr(new, n)]) for n in fine.__dataclass_fields__))

@@ -14,12 +14,12 @@ series the ring is computed on a finer grid with little blur and then blurred ex
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from dishmap.targets.edges import MOTION_TERMS, LocalMaps, Patches, edge_distance, monomials
 from dishmap.targets.pattern import TargetKind
@@ -27,6 +27,8 @@ from dishmap.targets.pattern import TargetKind
 Array = NDArray[Any]
 Single = NDArray[Any]
 Bool = NDArray[Any]
+# Columns of pixels, the circle whose edge they are at, and which circles (C,) are near them.
+Part = tuple[slice, int, Bool]
 
 # Geometry parameters of a target: 3 moves (mm), 3 turns (rad), edge offset (mm), edge offset (px), blur s (px), log gamma.
 GEOMETRY = 10
@@ -39,9 +41,16 @@ BAND_BLURS, BAND_EXTRA_PX = 2.5, 0.5
 # Above this product of curvature and blur the series for curved edges leaves more than 0.001 px; see tests.
 LARGEST_CURVED = 0.22
 FINE_FACTOR, FINE_BLUR_PX = 3, 0.4
-# Pixels handled at once, so that the working arrays stay in the processor's cache.
-PIXELS_AT_ONCE = 24000
+# A circle at least this many blurs away covers a pixel wholly or not at all: what is left is under 3e-5 of the contrast.
+FAR_BLURS = 4.0
+# A lens that changes its scale over the blur shifts edges by as much as half the change times the blur squared; where that is less
+# than this the plane is taken as affine about each pixel.
+LARGEST_SHIFT_PX = 2e-4
+# Pixels handled at once: fewer cost the overhead of numpy's calls, more leave the processor's cache.
+PIXELS_AT_ONCE = 40000
 TINY = np.float32(1e-6)
+# Halves of the coefficients of t^5 to t in formula 7.1.26 of Abramowitz and Stegun, Handbook of Mathematical Functions.
+ERF_TERMS = (0.5307027145, -0.7265760135, 0.7107068705, -0.142248368, 0.127414796)
 # Share of the cut up to which a residual keeps its full weight.
 TAPER = np.float32(0.65)
 # Ink over ground, as far as a tone curve is followed.
@@ -58,6 +67,21 @@ class Rings:
 
     def __len__(self) -> int:
         return len(self.radius_mm)
+
+    @property
+    def gap_mm(self) -> Single:
+        """Least distance (R, C, C) between the edges of two circles of a ring; infinite from or to an unused one."""
+        apart = np.linalg.norm(self.center_mm[:, :, None] - self.center_mm[:, None], axis=3)
+        mine, other = self.radius_mm[:, :, None], self.radius_mm[:, None]
+        used = (self.sign[:, :, None] != 0) & (self.sign[:, None] != 0)
+        return np.where(used, np.maximum(np.abs(mine - other) - apart, apart - mine - other), np.float32(np.inf))
+
+    @property
+    def ink_around(self) -> Single:
+        """Ink (R, C, C) that the second circle lays over the edge of the first: its sign if it holds the first, else 0."""
+        apart = np.linalg.norm(self.center_mm[:, :, None] - self.center_mm[:, None], axis=3)
+        holds = apart + self.radius_mm[:, :, None] <= self.radius_mm[:, None]
+        return holds * self.sign[:, None]
 
 
 def rings_of(kind: TargetKind, together: bool = False) -> Rings:
@@ -81,7 +105,9 @@ class RingPixels:
 
     ring (M,): which ring of its kind; patches: the area around each ring, with its target; s, t (M, n): coordinates of the
     pixels in the patch; grey (M, n): the photograph; used (M, n): false for padding and pixels left out.
-    shape: (H, W) of each ring's full window if the pixels are a whole window (fine rings), else None: blocks of 2x2.
+    shape: (H, W) of each ring's full window if the pixels are a whole window (fine rings), else None: blocks of 2x2, in the
+    order of the circle whose edge they are at. ends (C,): the column after each circle's last; clear_px (M, C, C): how far all
+    pixels at the first circle's edge are from the second's, at least.
     saturated (M,): share of the ring's pixels at the end of the scale, which are not used.
     blocked (M, n): pixels that count as lost to something in front of the print, or None where nothing is.
     """
@@ -93,6 +119,8 @@ class RingPixels:
     grey: Single
     used: Bool
     shape: tuple[int, int] | None = None
+    ends: tuple[int, ...] = ()
+    clear_px: Single | None = None
     blocked: Bool | None = None
     saturated: Array | None = None
 
@@ -105,16 +133,22 @@ class RingPixels:
         """The rings `rows` (M,), with targets renumbered by `number`."""
         p = self.patches
         patches = Patches(number[p.target[rows]], p.center_mm[rows], p.reach_mm[rows], p.anchor_px[rows], p.scale_px[rows])
-        blocked = None if self.blocked is None else self.blocked[rows]
-        return RingPixels(self.ring[rows], patches, self.s[rows], self.t[rows], self.grey[rows], self.used[rows], self.shape, blocked)
+        names = ("ring", "s", "t", "grey", "used", "clear_px", "blocked", "saturated")
+        mine: dict[str, Any] = {n: None if getattr(self, n) is None else getattr(self, n)[rows] for n in names}
+        return replace(self, patches=patches, **mine)
 
     def every(self, step: int) -> RingPixels:
         """Keep every `step`-th pixel, for the first coarse steps of a fit (bands only)."""
         if step == 1 or self.shape is not None:
             return self
-        cut = (slice(None), slice(None, None, step))
-        s, t, grey, used = (np.ascontiguousarray(values[cut]) for values in (self.s, self.t, self.grey, self.used))
-        return RingPixels(self.ring, self.patches, s, t, grey, used)
+        s, t, grey, used = (np.ascontiguousarray(values[:, ::step]) for values in (self.s, self.t, self.grey, self.used))
+        return replace(self, s=s, t=t, grey=grey, used=used, ends=tuple(-(-end // step) for end in self.ends))
+
+    def parts(self, rows: slice, blur_px: float) -> list[Part]:
+        """The parts of rings `rows`: the columns at each circle's edge, and which circles are not FAR_BLURS away there."""
+        assert self.clear_px is not None
+        near = self.clear_px[rows].min(axis=0, initial=np.inf) < FAR_BLURS * blur_px
+        return [(slice(a, b), i, near[i]) for i, (a, b) in enumerate(zip((0, *self.ends), self.ends, strict=False))]
 
 
 @dataclass(frozen=True)
@@ -165,81 +199,135 @@ class _Look:
     """What the coverage of some rings depends on, in single precision: local polynomials, circles, offsets and blur."""
 
     plane: Single
+    second: Single | None
     motion: Single
     degree: int
     center_mm: Single
     radius_mm: Single
     sign: Single
+    ink_around: Single
     offset_px: Single
     blur_px: Single
 
 
 def _look(rows: slice, pixels: RingPixels, rings: Rings, maps: LocalMaps, state: State) -> _Look:
     target, ring = pixels.target[rows], pixels.ring[rows]
+    shift_px = 0.5 * maps.bend_per_px[rows] * state.blur_px[target] ** 2
     single = [np.asarray(v[target], np.float32) for v in (state.offset_mm, state.offset_px, state.blur_px)]
     sign = rings.sign[ring]
     return _Look(
         maps.plane[rows].astype(np.float32),
+        maps.second[rows].astype(np.float32) if shift_px.max(initial=0.0) > LARGEST_SHIFT_PX else None,
         maps.motion[rows].astype(np.float32),
         maps.degree,
         rings.center_mm[ring],
         # ink spread moves dark edges out and light edges in
         rings.radius_mm[ring] + sign * single[0][:, None],
         sign,
+        rings.ink_around[ring],
         single[1],
         single[2],
     )
 
 
-def _coverage(look: _Look, s: Single, t: Single, blur_px: Single) -> tuple[Single, Single, Single]:
-    """Ink coverage (M, n), its derivative by the geometry (M, G, n) and each circle's edge weight (M, C, n)."""
+def _coverage(look: _Look, s: Single, t: Single, blur_px: Single, parts: list[Part], out: Single) -> tuple[Single, Single]:
+    """Ink coverage (M, n) and each circle's edge weight (M, C, n); the derivative by the geometry is put into `out` (M, G, n)."""
     mono = monomials(s, t, look.degree)
     six = look.plane @ mono
-    cover = np.zeros(s.shape, np.float32)
-    pull_u, pull_v = np.zeros_like(cover), np.zeros_like(cover)
-    out = np.zeros((len(s), GEOMETRY, s.shape[1]), np.float32)
-    edges = np.empty((len(s), look.radius_mm.shape[1], s.shape[1]), np.float32)
-    b = blur_px[:, None]
-    for c in range(look.radius_mm.shape[1]):
-        sign = look.sign[:, c, None]
-        d, nu, nv, px_per_mm, k = edge_distance(six, look.center_mm[:, c], look.radius_mm[:, c])
-        d += sign * look.offset_px[:, None]
-        kb = k * b
-        square = kb * kb
-        d -= (0.5 * b) * kb * (1 + np.float32(0.75) * square)
-        inverse = 1 / (b * (1 + np.float32(0.25) * square))
-        d *= inverse
-        cover += sign * ndtr(d)
-        density = np.exp(np.float32(-0.5) * d * d)
-        density *= inverse
-        density *= np.float32(0.3989423)
-        edges[:, c] = density * np.abs(sign)
-        out[:, OFFSET_PX] += edges[:, c]
-        out[:, OFFSET_MM] += edges[:, c] * px_per_mm
-        density *= sign
-        pull_u += density * nu
-        pull_v += density * nv
-        d += kb
-        d *= density
-        out[:, BLUR] -= d
-    few = mono[:, :MOTION_TERMS]
-    np.matmul(look.motion[:, 0], few, out=out[:, :6])
-    out[:, :6] *= pull_u[:, None]
-    second = look.motion[:, 1] @ few
-    second *= pull_v[:, None]
-    out[:, :6] += second
-    return cover, out, edges
+    second = None if look.second is None else look.second @ mono
+    cover = np.empty(s.shape, np.float32)
+    edges = np.zeros((len(s), look.radius_mm.shape[1], s.shape[1]), np.float32)
+    pull = np.zeros((len(s), 2, 1, s.shape[1]), np.float32)
+    out[:, 6:] = 0
+    for columns, own, near in parts:
+        # circles far from an edge hold all of it, or nothing
+        cover[:, columns] = (look.ink_around[:, own] * ~near).sum(axis=1, keepdims=True)
+        into = (cover[:, columns], edges[..., columns], pull[:, :, 0, columns], out[..., columns])
+        for c in np.flatnonzero(near):
+            _add_edge(look, int(c), six[..., columns], None if second is None else second[..., columns], blur_px, into)
+    motion = look.motion @ mono[:, None, :MOTION_TERMS]
+    motion *= pull
+    np.add(motion[:, 0], motion[:, 1], out=out[:, :6])
+    return cover, edges
 
 
-def coverage_columns(rows: slice, pixels: RingPixels, rings: Rings, maps: LocalMaps, state: State) -> tuple[Single, Single, Single]:
+def _add_edge(
+    look: _Look, c: int, six: Single, second: Single | None, blur_px: Single, into: tuple[Single, Single, Single, Single]
+) -> None:
+    """Add circle `c` to coverage, edge weights, pull (M, 2, n) on the image, and the derivatives by offsets and blur.
+
+    The work is done in place: passes over memory are what it costs.
+    """
+    cover, edges, pull, out = into
+    sign, b = look.sign[:, c, None], blur_px[:, None]
+    d, nu, nv, px_per_mm, kb = edge_distance(six, look.center_mm[:, c], look.radius_mm[:, c], second)
+    kb *= b
+    square = kb * kb
+    shift = square * np.float32(0.75)
+    shift += 1
+    shift *= kb
+    shift *= np.float32(0.5) * b
+    d -= shift
+    d += sign * look.offset_px[:, None]
+    square *= np.float32(0.25)
+    square += 1
+    square *= b
+    inverse = np.divide(1, square, out=square)
+    d *= inverse
+    density = np.multiply(d, d, out=shift)
+    density *= np.float32(-0.5)
+    np.exp(density, out=density)
+    cover += sign * normal_distribution(d, density)
+    density *= inverse
+    density *= np.abs(sign) * np.float32(0.3989423)
+    edges[:, c] = density
+    out[:, OFFSET_PX] += density
+    px_per_mm *= density
+    out[:, OFFSET_MM] += px_per_mm
+    density *= sign
+    nu *= density
+    nv *= density
+    pull[:, 0] += nu
+    pull[:, 1] += nv
+    d += kb
+    d *= density
+    out[:, BLUR] -= d
+
+
+def normal_distribution(z: Single, bell: Single) -> Single:
+    """Phi(z) to 1e-7, given bell = exp(-z^2 / 2): formula 7.1.26 of Abramowitz and Stegun, several times faster than ndtr."""
+    t = np.abs(z)
+    t *= np.float32(0.3275911 / np.sqrt(2))
+    t += 1
+    np.divide(1, t, out=t)
+    out = t * np.float32(ERF_TERMS[0])
+    for term in ERF_TERMS[1:]:
+        out += np.float32(term)
+        out *= t
+    out *= bell
+    # here is the tail beyond |z|
+    np.subtract(np.float32(0.5), out, out=out)
+    np.copysign(out, z, out=out)
+    out += np.float32(0.5)
+    return out
+
+
+def coverage_columns(
+    rows: slice, pixels: RingPixels, rings: Rings, maps: LocalMaps, state: State, out: Single | None = None
+) -> tuple[Single, Single, Single]:
     """Ink coverage of rings `rows` (M, n), its derivative by the geometry (M, G, n), edge weights of circles (M, C, n).
 
-    `maps` are those of `pixels.patches`; `state` holds the batch's targets.
+    `maps` are those of `pixels.patches`; `state` holds the batch's targets; the derivative is put into `out` if given.
     """
     look = _look(rows, pixels, rings, maps, state)
-    if pixels.shape is None:
-        return _coverage(look, pixels.s[rows], pixels.t[rows], look.blur_px)
-    return _fine_columns(rows, pixels, look)
+    s, t = pixels.s[rows], pixels.t[rows]
+    if out is None:
+        out = np.empty((len(s), GEOMETRY, s.shape[1]), np.float32)
+    if pixels.shape is not None:
+        cover, out[:], edges = _fine_columns(rows, pixels, look)
+    else:
+        cover, edges = _coverage(look, s, t, look.blur_px, pixels.parts(rows, float(look.blur_px.max(initial=0))), out)
+    return cover, out, edges
 
 
 def _fine_columns(rows: slice, pixels: RingPixels, look: _Look) -> tuple[Single, Single, Single]:
@@ -257,7 +345,9 @@ def _fine_columns(rows: slice, pixels: RingPixels, look: _Look) -> tuple[Single,
     t = (pixels.t[rows, :1] + (j - first) * step[:, None]).astype(np.float32)
     # the window's corners lie beyond the patch, where its polynomials mean nothing; no edge is there
     outside = s * s + t * t > 1
-    cover, columns, edges = _coverage(look, s * ~outside, t * ~outside, np.full(len(blur), FINE_BLUR_PX, np.float32))
+    whole = (slice(None), 0, np.ones(look.radius_mm.shape[1], bool))
+    columns = np.empty((len(s), GEOMETRY, s.shape[1]), np.float32)
+    cover, edges = _coverage(look, s * ~outside, t * ~outside, np.full(len(blur), FINE_BLUR_PX, np.float32), [whole], columns)
     cover[outside] = 0
     columns *= ~outside[:, None]
     edges *= ~outside[:, None]
@@ -291,18 +381,22 @@ def toned(cover: Single, dark_over_light: Single, log_gamma: Single) -> tuple[Si
     """
     gamma = np.exp(log_gamma)
     power = dark_over_light**gamma
-    light = 1 - (1 - power) * cover
-    log_light = np.log(light)
-    level = np.exp(log_light / gamma)
     scale = 1 / (1 - dark_over_light)
-    slope = level / light * ((1 - power) * scale / gamma)
-    by_gamma = (log_light / gamma - power * np.log(dark_over_light) * cover / light) * level * scale
-    return (1 - level) * scale, slope, by_gamma
+    light = cover * (power - 1)
+    light += 1
+    log_level = np.log(light)
+    log_level *= 1 / gamma
+    level = np.exp(log_level)
+    by_light = np.divide(level, light, out=light)
+    log_level *= level * scale
+    log_level -= cover * by_light * (scale * power * np.log(dark_over_light))
+    return (1 - level) * scale, by_light * ((1 - power) * scale / gamma), log_level
 
 
-def light_columns(s: Single, t: Single, cover: Single) -> Single:
+def light_columns(s: Single, t: Single, cover: Single, out: Single | None = None) -> Single:
     """Derivative of the pixels by the ring's light levels (M, L, n): ground and ink, each level and two slopes, and the bend."""
-    out = np.empty((len(cover), LIGHT, cover.shape[1]), np.float32)
+    if out is None:
+        out = np.empty((len(cover), LIGHT, cover.shape[1]), np.float32)
     np.subtract(1, cover, out=out[:, 0])
     out[:, 3] = cover
     for column, place in ((1, s), (2, t)):
@@ -313,25 +407,32 @@ def light_columns(s: Single, t: Single, cover: Single) -> Single:
     return out
 
 
-def solve_light(columns: Single, grey: Single, weight: Single) -> Array:
-    """Best light levels (M, L) of each ring for a given coverage; slopes lean weakly towards zero so that tiny rings hold."""
-    weighted = columns * weight[:, None]
-    normal = (weighted @ np.swapaxes(columns, 1, 2)).astype(float)
-    right = (weighted @ grey[..., None]).astype(float)
+def solve_light(weighted: Single) -> Array:
+    """Best light levels (M, L) of each ring for a given coverage; slopes lean weakly towards zero so that tiny rings hold.
+
+    weighted (M, L + 1, n): the columns of `light_columns` and the grey levels, times the roots of the weights.
+    """
+    sums = (weighted @ np.swapaxes(weighted, 1, 2)).astype(float)
+    normal = sums[:, :LIGHT, :LIGHT]
     normal[:, range(LIGHT), range(LIGHT)] += _ridge(normal)
-    return np.linalg.solve(normal, right)[..., 0]
+    return np.linalg.solve(normal, sums[:, :LIGHT, LIGHT:])[..., 0]
 
 
 def _ridge(normal: Array) -> Array:
     return 1e-7 * np.maximum(np.trace(normal, axis1=1, axis2=2), 1e-9)[:, None]
 
 
+def batches(rings: int, pixels: int) -> list[slice]:
+    """Equal shares of `rings` with `pixels` each, small enough for the processor's cache."""
+    count = max(1, min(rings, -(-rings * pixels // PIXELS_AT_ONCE)))
+    ends = [rings * i // count for i in range(count + 1)]
+    return [slice(a, b) for a, b in pairwise(ends)]
+
+
 def ring_sums(pixels: RingPixels, rings: Rings, maps: LocalMaps, state: State, weighting: Weighting) -> tuple[RingSums, Single]:
     """One pass over the pixels: normal equations of every ring at the present state, and the residuals (M, n) in grey levels."""
     parts, residuals = [], []
-    many = max(1, PIXELS_AT_ONCE // max(1, pixels.s.shape[1]))
-    for begin in range(0, len(pixels.ring), many):
-        rows = slice(begin, begin + many)
+    for rows in batches(*pixels.s.shape):
         sums, residual = _sums(rows, pixels, rings, maps, state, weighting)
         parts.append(sums)
         residuals.append(residual)
@@ -340,39 +441,58 @@ def ring_sums(pixels: RingPixels, rings: Rings, maps: LocalMaps, state: State, w
 
 
 def _sums(rows: slice, pixels: RingPixels, rings: Rings, maps: LocalMaps, state: State, weighting: Weighting) -> tuple[RingSums, Single]:
-    cover, geometry, edges = coverage_columns(rows, pixels, rings, maps, state)
     used, grey = pixels.used[rows].astype(np.float32), pixels.grey[rows]
     s, t = pixels.s[rows], pixels.t[rows]
+    # geometry, light and grey level of each pixel, filled and weighted in place
+    every = np.empty((len(s), GEOMETRY + LIGHT + 1, s.shape[1]), np.float32)
+    cover, geometry, edges = coverage_columns(rows, pixels, rings, maps, state, every[:, :GEOMETRY])
     log_gamma = np.asarray(state.log_gamma[pixels.target[rows], None], np.float32)
     bent, slope, geometry[:, TONE] = toned(np.clip(cover, 0, 1), _dark_over_light(cover, grey, used), log_gamma)
-    columns = light_columns(s, t, bent)
-    seen = used if pixels.blocked is None else used * ~pixels.blocked[rows]
-    light, model = _levels(columns, grey, seen)
-    robust = seen
-    if weighting.cut is not None:
-        cut = weighting.cut[rows, None].astype(np.float32)
-        robust = _tapered(grey - model, cut, seen)
-        if not np.array_equal(robust, seen):
-            # the levels were found with the outliers in; once more without them
-            light, model = _levels(columns, grey, robust)
-            robust = _tapered(grey - model, cut, seen)
-    residual = grey - model
+    light_columns(s, t, bent, every[:, GEOMETRY:-1])
+    every[:, -1] = grey
+    every[:, GEOMETRY:] *= used[:, None]
+    cut = None if weighting.cut is None else weighting.cut[rows, None].astype(np.float32)
+    light, robust = _light_and_weights(every[:, GEOMETRY:], used if pixels.blocked is None else used * ~pixels.blocked[rows], used, cut)
+    single = light.astype(np.float32)
+    model = (single[:, None] @ every[:, GEOMETRY:-1])[:, 0]
+    residual = every[:, -1] - model
     variance = np.maximum(np.float32(weighting.base) + np.float32(weighting.slope) * np.maximum(model, 0), TINY)
-    weight = robust / variance
-    root = np.sqrt(weight)
-    step = (light[:, INK] - light[:, GROUND]).astype(np.float32)
+    root = np.sqrt(robust / variance)
+    step = single[:, INK] - single[:, GROUND]
     contrast = (step[:, :1] + step[:, 1:2] * s + step[:, 2:] * t) * root
-    every = np.empty((len(s), GEOMETRY + LIGHT, s.shape[1]), np.float32)
-    np.multiply(geometry[:, :TONE], (contrast * slope)[:, None], out=every[:, :TONE])
-    np.multiply(geometry[:, TONE], contrast, out=every[:, TONE])
-    np.multiply(columns, root[:, None], out=every[:, GEOMETRY:])
-    normal = (every @ np.swapaxes(every, 1, 2)).astype(float)
-    right = (every @ (residual * root)[..., None])[..., 0].astype(float)
-    whole = (edges @ used[..., None])[..., 0]
-    # unused circles, and rings without pixels, count as whole
-    kept = np.where(whole > TINY, (edges @ robust[..., None])[..., 0] / np.maximum(whole, TINY), 1.0)
-    square = np.einsum("mn,mn,mn->m", weight, residual, residual).astype(float)
-    return RingSums(normal, right, light, square, robust.sum(axis=1, dtype=float), kept.astype(float)), residual
+    geometry[:, TONE] *= contrast
+    contrast *= slope
+    geometry[:, :TONE] *= contrast[:, None]
+    every[:, -1] = residual
+    every[:, GEOMETRY:] *= root[:, None]
+    sums = (every @ np.swapaxes(every, 1, 2)).astype(float)
+    kept = np.ones(edges.shape[:2])
+    if robust is not used:
+        whole = (edges @ used[..., None])[..., 0]
+        # unused circles, and rings without pixels, count as whole
+        kept = np.where(whole > TINY, (edges @ robust[..., None])[..., 0] / np.maximum(whole, TINY), 1.0).astype(float)
+    return RingSums(sums[:, :-1, :-1], sums[:, :-1, -1], light, sums[:, -1, -1], robust.sum(axis=1, dtype=float), kept), residual
+
+
+def _light_and_weights(rows: Single, seen: Single, used: Single, cut: Single | None) -> tuple[Array, Single]:
+    """Light levels (M, L) and weights (M, n) of pixels, from the rows of `solve_light` with weights `used` (0 or 1).
+
+    `seen` are weights of what is to be looked at, a part of `used`; `cut` (M, 1) is that of `Weighting`.
+    """
+
+    def levels(weight: Single) -> tuple[Array, Single]:
+        light = solve_light(rows if weight is used else rows * np.sqrt(weight)[:, None])
+        return light, rows[:, LIGHT] - (light[:, None].astype(np.float32) @ rows[:, :LIGHT])[:, 0]
+
+    light, residual = levels(seen)
+    if cut is None:
+        return light, seen
+    robust = _tapered(residual, cut, seen)
+    if robust is not seen:
+        # the levels were found with the outliers in; once more without them
+        light, residual = levels(robust)
+        robust = _tapered(residual, cut, seen)
+    return light, robust
 
 
 def _dark_over_light(cover: Single, grey: Single, used: Single) -> Single:
@@ -384,11 +504,6 @@ def _dark_over_light(cover: Single, grey: Single, used: Single) -> Single:
     ground, step = (c * p - b * q) / determinant, (a * q - b * p) / determinant
     ratio = (ground + step) / np.maximum(ground, TINY)
     return np.clip(ratio, *TONE_RATIOS)[:, None].astype(np.float32)
-
-
-def _levels(columns: Single, grey: Single, weight: Single) -> tuple[Array, Single]:
-    light = solve_light(columns, grey, weight)
-    return light, (light[:, None].astype(np.float32) @ columns)[:, 0]
 
 
 def _tapered(residual: Single, cut: Single, used: Single) -> Single:

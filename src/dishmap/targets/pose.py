@@ -17,16 +17,29 @@ from threadpoolctl import threadpool_limits
 from dishmap.camera.model import Camera
 from dishmap.errors import CameraError, ImageError, MeasurementError
 from dishmap.quality import Quality, is_rejected, names
-from dishmap.targets.adjust import Adjusted, by_target, inverse_scaled
+from dishmap.targets.adjust import Adjusted, Priors, by_target, inverse_scaled, prior_terms
 from dishmap.targets.detect import Detections
 from dishmap.targets.identify import Identity
 from dishmap.targets.pattern import Pattern
-from dishmap.targets.pixels import GEOMETRY, OFFSET_MM, OFFSET_PX, RingPixels
+from dishmap.targets.pixels import BLUR, GEOMETRY, OFFSET_MM, OFFSET_PX, TONE, RingPixels
 from dishmap.targets.scene_noise import NoiseModel, noise_model
-from dishmap.targets.sensitivity import calibration_jacobian, mirror_evidence, mirrored_normals
-from dishmap.targets.stages import OCCLUDED_BELOW, Assumptions, Group, Shared, coarse_fit, full_fit, learn, regroup, start_groups
+from dishmap.targets.sensitivity import calibration_jacobian
+from dishmap.targets.settle import with_clear_light, with_learnt_normals, with_likelier_normals
+from dishmap.targets.stages import (
+    OCCLUDED_BELOW,
+    Assumptions,
+    Fit,
+    Group,
+    Shared,
+    coarse_fit,
+    full_fit,
+    learn,
+    printed_ink,
+    regroup,
+    start_groups,
+)
 from dishmap.targets.start import centers_of
-from dishmap.transforms import Pose, angle_between_rad
+from dishmap.transforms import Pose
 
 Array = NDArray[Any]
 Index = NDArray[np.int64]
@@ -40,8 +53,6 @@ POOR_FIT_RATIO, LEAST_CONTRAST_SIGMAS = 2.5, 4.0
 COHERENT_PIXELS, OBSTACLE_ALLOWANCE = 9.0, 30.0
 # Share of a ring's pixels at the end of the scale from which glare is said.
 MOST_SATURATED = 0.02
-# Mirrored poses whose chi-square would differ by less than this (3 sigma) cannot be told apart.
-MIRROR_CHI_SQUARE = 9.0
 # Depth leans on the assumed edge offset when knowing the offset would shrink its sigma by more than this.
 WEAK_DEPTH_RATIO = 2.0
 
@@ -52,8 +63,10 @@ class TargetPoses:
 
     index: place in the pattern; ids; position_mm, normal (N, 3), normal towards the camera; rotation (N, 3, 3)
     camera_from_target; covariance (N, 6, 6) of (move along camera axes in mm, turn about target axes in rad) from this
-    photograph's noise; center_px (N, 2) and covariance_px2 (N, 2, 2) of the projected target centre; sigma_normal_rad (N,)
-    root mean square angle; calibration_jacobian (N, 3, P) d position / d camera parameters; blur_px (N,) total blur,
+    photograph's noise; information (N, 7, 7) and pull (N, 7): what the pixels alone say of a change of (move, turn, edge
+    offset in mm), as the Gaussian log-likelihood pull . x - x . information x / 2, without the priors on normal and
+    edge offset that `covariance` holds; prior (N, 7): the precision of those priors; center_px (N, 2) and covariance_px2
+    (N, 2, 2) of the projected target centre; sigma_normal_rad (N,) root mean square angle; calibration_jacobian (N, 3, P) d position / d camera parameters; blur_px (N,) total blur,
     offset_mm (N,) edge offset, contrast, noise (N,) grey levels; kept (N,) smallest share of a circle's edge that was used;
     quality (N,) bits of `Quality`.
     camera_from_dish: rigid pose of the undeformed pattern; normal_sigma_rad: spread of normals about the pattern's surface,
@@ -66,6 +79,9 @@ class TargetPoses:
     normal: Array
     rotation: Array
     covariance: Array
+    information: Array
+    pull: Array
+    prior: Array
     center_px: Array
     covariance_px2: Array
     sigma_normal_rad: Array
@@ -119,14 +135,15 @@ def _measure(
     groups, rejected = start_groups(camera, pattern, detections, identity, assumptions)
     total = 2 * len(groups)
     coarse = []
+    ink = printed_ink(camera, pattern, groups, identity.camera_from_dish)
     for group in groups:
-        fit = coarse_fit(image, group)
+        fit = coarse_fit(image, group, ink)
         if not np.isfinite(fit.adjusted.poses.position_mm).all():
             good = np.asarray(np.isfinite(fit.adjusted.poses.position_mm).all(axis=1))
             rejected += [(int(pattern.ids[i]), "its pixels do not look like the printed target") for i in group.index[~good]]
             if not good.any():
                 continue
-            fit = coarse_fit(image, regroup(group, good))
+            fit = coarse_fit(image, regroup(group, good), ink)
         coarse.append(fit)
         tell(len(coarse), total)
     if not coarse:
@@ -134,11 +151,12 @@ def _measure(
             "no named target lies wholly inside the image; move the camera back or turn it so that whole targets are seen"
         )
     shared = learn(camera, pattern, identity.camera_from_dish, coarse, assumptions)
+    ink = printed_ink(camera, pattern, [fit.group for fit in coarse], shared.camera_from_dish)
     fits = []
     for fit in coarse:
-        fits.append(full_fit(image, pattern, fit, shared))
+        fits.append(full_fit(image, pattern, fit, shared, ink))
         tell(len(coarse) + len(fits), total)
-    return _collect(image, pattern, fits, shared, rejected)
+    return _collect(image, pattern, fits, shared, assumptions, rejected)
 
 
 def check_image(image: NDArray[Any], camera: Camera) -> None:
@@ -158,13 +176,17 @@ def check_image(image: NDArray[Any], camera: Camera) -> None:
 def _collect(
     image: NDArray[Any],
     pattern: Pattern,
-    fits: list[tuple[Group, Adjusted, RingPixels]],
+    fits: list[Fit],
     shared: Shared,
+    assumptions: Assumptions,
     rejected: list[tuple[int, str]],
 ) -> TargetPoses:
     blocks = [p.shape is None for _, _, p in fits]
     pooled = noise_model([p.grey for _, _, p in fits], [a.residual for _, a, _ in fits], [p.used for _, _, p in fits], blocks)
     noise = replace(shared.noise, inflation=pooled.inflation)
+    if assumptions.normal_sigma_deg is None:
+        fits, shared = with_learnt_normals(fits, shared, noise.inflation)
+    fits = with_clear_light(with_likelier_normals(fits, noise), noise)
     parts = [_results(image, group, adjusted, pixels, noise) for group, adjusted, pixels in fits]
     every = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     order = np.argsort(every["index"])
@@ -193,7 +215,8 @@ def _results(image: NDArray[Any], group: Group, adjusted: Adjusted, pixels: Ring
     prior = adjusted.information - adjusted.data_information
     covariance = inverse_scaled(data + prior)
     kept = _kept(adjusted, pixels, count)
-    pose_covariance = covariance[:, :6, :6] * _allowance(adjusted.noise_variance, kept)[:, None, None]
+    allowance = _allowance(adjusted.noise_variance, kept)
+    pose_covariance = covariance[:, :6, :6] * allowance[:, None, None]
     steps = poses.steps
     turned = np.zeros((count, 6, 6))
     turned[:, :3, :3], turned[:, 3:, 3:] = steps, np.eye(3)
@@ -219,8 +242,32 @@ def _results(image: NDArray[Any], group: Group, adjusted: Adjusted, pixels: Ring
         "noise": sigma,
         "kept": kept,
     }
-    columns["quality"] = _quality(image, group, adjusted, pixels, columns, data + prior, edge_information)
+    columns["information"], columns["pull"], columns["prior"] = _likelihood(batch.priors, adjusted, turned, noise.inflation * allowance)
+    columns["quality"] = _quality(image, group, adjusted, pixels, columns, data + prior)
     return columns
+
+
+def _likelihood(priors: Priors, adjusted: Adjusted, turned: Array, enlarged: Array) -> tuple[Array, Array, Array]:
+    """What the pixels alone say of pose and edge offset: information (T, 7, 7) and pull (T, 7) at the estimate; the priors (T, 7).
+
+    There the pixels' pull and the priors' cancel, so the pixels pull against the priors. Blur, tone curve and blooming keep
+    their priors and are eliminated. `enlarged` (T,) divides both, as it multiplies covariances.
+    """
+    precision, pull = prior_terms(adjusted.poses, adjusted.state, priors)
+    known, rest = [*range(6), OFFSET_MM], [OFFSET_PX, BLUR, TONE]
+    full = adjusted.data_information.copy()
+    full[:, rest, rest] += precision[:, rest]
+    cross = full[:, known][:, :, rest]
+    solved = np.linalg.solve(full[:, rest][:, :, rest], np.swapaxes(cross, 1, 2))
+    information = full[:, known][:, :, known] - cross @ solved
+    axes = np.zeros((len(full), 7, 7))
+    axes[:, :6, :6], axes[:, 6, 6] = turned, 1.0
+    against = -pull[:, known]
+    return (
+        axes @ information @ np.swapaxes(axes, 1, 2) / enlarged[:, None, None],
+        np.einsum("tij,tj->ti", axes, against) / enlarged[:, None],
+        precision[:, known],
+    )
 
 
 def _allowance(misfit: Array, kept: Array) -> Array:
@@ -248,7 +295,6 @@ def _quality(
     pixels: RingPixels,
     columns: dict[str, Array],
     information: Array,
-    edge_information: Array,
 ) -> Index:
     count = len(group.index)
     bits = np.zeros(count, np.int64)
@@ -266,27 +312,16 @@ def _quality(
     bright, lost = _lost_edges(adjusted, pixels, count)
     dropped = np.bincount(pixels.target[~pixels.used.any(axis=1)], minlength=count) > 0
     flag(lost & bright, Quality.GLARE)
+    if group.glare is not None:
+        flag(group.glare, Quality.GLARE)
     flag((lost & ~bright) | dropped, Quality.OCCLUDED)
-    flag(_ambiguous(group, adjusted, columns, edge_information), Quality.AMBIGUOUS_NORMAL)
+    if group.ambiguous is not None:
+        flag(group.ambiguous, Quality.AMBIGUOUS_NORMAL)
     known = [i for i in range(GEOMETRY) if i not in (OFFSET_MM, OFFSET_PX)]
     free = inverse_scaled(information)[:, 2, 2]
     fixed = inverse_scaled(information[:, known][:, :, known])[:, 2, 2]
     flag(free > WEAK_DEPTH_RATIO**2 * fixed, Quality.WEAK_DEPTH)
     return bits
-
-
-def _ambiguous(group: Group, adjusted: Adjusted, columns: dict[str, Array], edge_information: Array) -> Array:
-    """Where (T,) the mirrored normal is as likely, and far enough away to matter."""
-    batch, poses, normal = group.batch, adjusted.poses, columns["normal"]
-    mirrored, priors = mirrored_normals(poses), batch.priors
-    out = angle_between_rad(normal, mirrored) > 2 * columns["sigma_normal_rad"]
-    prior = (angle_between_rad(mirrored, priors.normal) ** 2 - angle_between_rad(normal, priors.normal) ** 2) / priors.normal_sigma_rad**2
-    # where the surface alone decides, the pixels need not be asked
-    out &= prior < MIRROR_CHI_SQUARE
-    if out.any():
-        some = replace(batch, curvature_per_mm=batch.curvature_per_mm[out])
-        out[out] = mirror_evidence(some, group.kind, poses.take(out), edge_information[out]) + prior[out] < MIRROR_CHI_SQUARE
-    return out
 
 
 def _lost_edges(adjusted: Adjusted, pixels: RingPixels, count: int) -> tuple[Array, Array]:

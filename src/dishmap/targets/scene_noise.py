@@ -1,4 +1,4 @@
-"""What the residuals of all targets together say of the photograph's noise."""
+"""What all targets together say of the photograph: its noise, and how far normals stray from the pattern's surface."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dishmap.targets.adjust import Adjusted, Priors, inverse_scaled
+
 Array = NDArray[Any]
 
 LEVELS = 12
@@ -16,6 +18,10 @@ LEAST_RATIO = 1.3
 ROBUST_TO_SIGMA = 1.4826
 # A correlation under this is what white noise shows by chance in the pixels of a few targets.
 LEAST_CORRELATION = 0.01
+# A normal that the pixels pull farther than this from the surface, in sigmas of the prior, is left to the pixels.
+STRAY_SIGMAS = 4.0
+LEAST_NORMAL_SIGMA_RAD = np.radians(0.02)
+SPREADS = 60
 
 
 @dataclass(frozen=True)
@@ -93,3 +99,46 @@ def _inflation(pairs: list[tuple[float, float, float]]) -> float:
         if rho > LEAST_CORRELATION:
             factor *= (1 + rho) / (1 - rho)
     return float(factor)
+
+
+def free_tilt(fit: Adjusted, priors: Priors, expected: Array) -> tuple[Array, Array]:
+    """Tilt (T, 2) of targets from the expected normals (T, 3), about their own axes, and its covariance from data alone.
+
+    `priors` are those of the fit: what they say of the normals is taken out again.
+    """
+    posterior = inverse_scaled(fit.information)[:, 3:5, 3:5]
+    tilt = _tilt(fit, expected)
+    precision = priors.normal_sigma_rad[:, None, None] ** -2.0
+    data = np.linalg.inv(posterior) - precision * np.eye(2)
+    data += 1e-9 * np.eye(2) * np.maximum(np.trace(data, axis1=1, axis2=2), 1e-3)[:, None, None]
+    covariance = np.linalg.inv(data)
+    shift = (covariance @ _tilt(fit, priors.normal)[..., None])[..., 0] * precision[:, 0]
+    return tilt + shift, covariance
+
+
+def _tilt(fit: Adjusted, normal: Array) -> Array:
+    """Turns (T, 2) about the targets' own x and y axes that take the given normals (T, 3) to the fitted ones."""
+    tips = np.einsum("tji,tj->ti", fit.poses.rotation, normal)
+    return np.stack([tips[:, 1], -tips[:, 0]], axis=1)
+
+
+def normal_spread(tilt: Array, covariance: Array, widest_rad: float) -> float:
+    """Standard deviation (rad, per axis) of true tilts about the surface, root mean square over all that the targets allow.
+
+    Tilts (T, 2) are normal with covariance (T, 2, 2) (data) + spread^2; the few that stray far are held at 4 sigma, so that one bent
+    corner does not loosen the whole surface. Where the data cannot tell a small spread from none, the likeliest one may be nothing
+    while normals stray by more than the sigma that follows from it. So the variance is averaged over the likelihood, every spread up
+    to `widest_rad` being as likely beforehand (Gelman 2006, Bayesian Analysis 1, 515).
+    """
+    good = np.isfinite(covariance).all(axis=(1, 2)) & (np.abs(tilt) < 2 * widest_rad).all(axis=1)
+    if good.sum() < 4:
+        return widest_rad
+    values, vectors = np.linalg.eigh(covariance[good])
+    along = np.einsum("tji,tj->ti", vectors, tilt[good])
+    grid = np.geomspace(LEAST_NORMAL_SIGMA_RAD, widest_rad, SPREADS)
+    variance = np.maximum(values[None], 1e-14) + grid[:, None, None] ** 2
+    square = np.minimum(along[None] ** 2 / variance, STRAY_SIGMAS**2)
+    likelihood = -0.5 * (square + np.log(variance)).sum(axis=(1, 2))
+    # steps of the grid grow with the spread
+    weight = np.exp(likelihood - likelihood.max()) * grid
+    return float(np.sqrt((weight * grid**2).sum() / weight.sum()))

@@ -1,4 +1,4 @@
-"""How a measured pose would change: with the camera's parameters, and against its mirrored twin."""
+"""How a measured pose would change with the camera's parameters, and what its mirrored twin is."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dishmap.targets.adjust import Batch, solve_scaled
+from dishmap.targets.adjust import Batch
 from dishmap.targets.edges import Poses, project_printed
 from dishmap.targets.pattern import TargetKind, bent_print_mm
 from dishmap.targets.window import OUTLINE_POINTS
@@ -15,10 +15,8 @@ from dishmap.transforms import rotation_from_vector
 
 Array = NDArray[Any]
 
-MIRROR_STEPS = 4
 
-
-def _outline_samples(kind: TargetKind) -> tuple[Array, Array]:
+def outline_samples(kind: TargetKind) -> tuple[Array, Array]:
     """Printed positions (Q, 2) around all circles, and the mm of edge each stands for (Q,)."""
     angle = 2 * np.pi * (np.arange(OUTLINE_POINTS) + 0.5) / OUTLINE_POINTS
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -26,7 +24,7 @@ def _outline_samples(kind: TargetKind) -> tuple[Array, Array]:
     return xy, np.repeat(2 * np.pi * kind.radius_mm / OUTLINE_POINTS, OUTLINE_POINTS)
 
 
-def _edge_normals(pixels: Array, kind: TargetKind) -> tuple[Array, Array]:
+def edge_normals(pixels: Array, kind: TargetKind) -> tuple[Array, Array]:
     """Unit normals (T, Q, 2) of projected outlines and px of edge per sample (T, Q), by differences along each circle."""
     around = pixels.reshape(len(pixels), len(kind.radius_mm), OUTLINE_POINTS, 2)
     along = 0.5 * (np.roll(around, -1, axis=2) - np.roll(around, 1, axis=2)).reshape(pixels.shape)
@@ -39,12 +37,12 @@ def calibration_jacobian(batch: Batch, kind: TargetKind, poses: Poses, edge_info
 
     edge_information (T,): information per px of edge (1 / px^2 per px), so that the prior on normals has its due weight.
     """
-    xy, _ = _outline_samples(kind)
+    xy, _ = outline_samples(kind)
     pixels, motion = project_printed(batch.camera, poses, batch.curvature_per_mm, xy)
     local = bent_print_mm(np.broadcast_to(xy, (len(poses), *xy.shape)), batch.curvature_per_mm)
     points = poses.in_camera(local)
     _, _, by_camera = batch.camera.project_with_jacobians(points)
-    normals, length = _edge_normals(pixels, kind)
+    normals, length = edge_normals(pixels, kind)
     pose_columns = np.einsum("tqk,tqkp->tqp", normals, motion)
     camera_columns = np.einsum("tqk,tqkc->tqc", normals, by_camera)
     weighted = pose_columns * (length * edge_information[:, None])[..., None]
@@ -65,29 +63,10 @@ def mirrored_normals(poses: Poses) -> Array:
     return 2 * (normal * ray).sum(axis=1, keepdims=True) * ray - normal
 
 
-def mirror_evidence(batch: Batch, kind: TargetKind, poses: Poses, edge_information: Array) -> Array:
-    """Rise of chi-square (T,) that pixels would show at the mirrored pose: the little perspective within the target."""
-    normal, mirrored = poses.rotation[..., 2], mirrored_normals(poses)
-    axis = np.cross(normal, mirrored)
+def mirrored(poses: Poses) -> Poses:
+    """Poses at the same places, turned the shortest way to the mirrored normals."""
+    normal, other = poses.rotation[..., 2], mirrored_normals(poses)
+    axis = np.cross(normal, other)
     sine = np.linalg.norm(axis, axis=1, keepdims=True)
-    angle = np.arctan2(sine, (normal * mirrored).sum(axis=1, keepdims=True))
-    turn = rotation_from_vector(axis / np.maximum(sine, 1e-15) * angle)
-    other = Poses(turn @ poses.rotation, poses.position_mm)
-    xy, _ = _outline_samples(kind)
-    seen, _ = project_printed(batch.camera, poses, batch.curvature_per_mm, xy)
-    normals, length = _edge_normals(seen, kind)
-    weight = length * edge_information[:, None]
-    for _ in range(MIRROR_STEPS):
-        pixels, motion = project_printed(batch.camera, other, batch.curvature_per_mm, xy)
-        gap = np.einsum("tqk,tqk->tq", normals, seen - pixels)
-        columns = np.einsum("tqk,tqkp->tqp", normals, motion)
-        weighted = np.swapaxes(columns * weight[..., None], 1, 2)
-        information = weighted @ columns
-        information[:, range(6), range(6)] += 1e-9 * np.maximum(np.trace(information, axis1=1, axis2=2), 1e-9)[:, None]
-        delta = solve_scaled(information, (weighted @ gap[..., None])[..., 0])
-        delta[:, 3:] = np.clip(delta[:, 3:], -0.1, 0.1)
-        position = other.position_mm + np.einsum("tij,tj->ti", other.steps, delta[:, :3])
-        other = Poses(other.rotation @ rotation_from_vector(delta[:, 3:]), position)
-    pixels, _ = project_printed(batch.camera, other, batch.curvature_per_mm, xy)
-    gap = np.einsum("tqk,tqk->tq", normals, seen - pixels)
-    return (weight * gap * gap).sum(axis=1)
+    angle = np.arctan2(sine, (normal * other).sum(axis=1, keepdims=True))
+    return Poses(rotation_from_vector(axis / np.maximum(sine, 1e-15) * angle) @ poses.rotation, poses.position_mm)

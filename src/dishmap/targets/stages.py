@@ -10,13 +10,31 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from dishmap.camera.model import Camera
-from dishmap.targets.adjust import Adjusted, Batch, Priors, adjust, by_target, inverse_scaled, with_other_priors, with_rest
+from dishmap.targets.adjust import (
+    Adjusted,
+    Batch,
+    Priors,
+    adjust,
+    by_target,
+    inverse_scaled,
+    with_other_priors,
+    with_rest,
+)
 from dishmap.targets.detect import Detections
 from dishmap.targets.edges import Poses
 from dishmap.targets.identify import Identity
+from dishmap.targets.neighbours import Ink, clear_of_neighbours, ink_of
 from dishmap.targets.pattern import Pattern, TargetKind
 from dishmap.targets.pixels import TONE, RingPixels, State, Weighting, rings_of
-from dishmap.targets.scene_noise import ROBUST_TO_SIGMA, NoiseModel, noise_model
+from dishmap.targets.scene_noise import (
+    LEAST_NORMAL_SIGMA_RAD,
+    ROBUST_TO_SIGMA,
+    STRAY_SIGMAS,
+    NoiseModel,
+    free_tilt,
+    noise_model,
+    normal_spread,
+)
 from dishmap.targets.start import EllipsePoints, centers_of, ellipse_points, fit_ellipses, nominal_poses, pair_circles, rigid_pose
 from dishmap.targets.window import outline, patches_around, ring_areas, ring_layout, ring_pixels
 from dishmap.transforms import Pose, angle_between_rad
@@ -46,9 +64,6 @@ LEAST_CONTRAST_SHARE = 0.5
 OCCLUDED_BELOW, OBSTACLE_BLURS = 0.97, 2.0
 # A ring's cut may exceed the picture's usual one, relative to contrast, by this factor.
 WIDEST_CUT = 1.5
-# A normal that the pixels pull farther than this from the surface, in sigmas of the prior, is left to the pixels.
-STRAY_SIGMAS = 4.0
-LEAST_NORMAL_SIGMA_RAD = np.radians(0.02)
 
 
 @dataclass(frozen=True)
@@ -67,13 +82,19 @@ class Assumptions:
 
 @dataclass(frozen=True)
 class Group:
-    """Targets of one kind and similar size in the image that are adjusted together."""
+    """Targets of one kind and similar size in the image that are adjusted together.
+
+    glare (T,): whose light was found to bend more than the model allows; ambiguous (T,): whose pixels fit a mirrored normal as well;
+    None before that was looked at.
+    """
 
     kind: TargetKind
     index: Index
     poses: Poses
     batch: Batch
     state: State
+    glare: Bool | None = None
+    ambiguous: Bool | None = None
 
     def outlines(self) -> Array:
         """Projected outlines of all circles (T, C, Q, 2) at the group's poses."""
@@ -106,6 +127,10 @@ class Shared:
     cut_share: float
 
 
+# A group after the full fit, with its pixels.
+Fit = tuple[Group, Adjusted, RingPixels]
+
+
 def start_groups(
     camera: Camera, pattern: Pattern, detections: Detections, identity: Identity, assumptions: Assumptions
 ) -> tuple[list[Group], list[tuple[int, str]]]:
@@ -131,6 +156,17 @@ def start_groups(
             if inside.any():
                 groups.append(regroup(group, inside))
     return groups, rejected
+
+
+def printed_ink(camera: Camera, pattern: Pattern, groups: list[Group], camera_from_dish: Pose) -> Ink:
+    """Where the ink of all targets is: of the groups' at their poses, of the others on the undeformed pattern."""
+    parts = [(group.kind, group.index, group.poses) for group in groups]
+    rest = np.setdiff1d(np.arange(len(pattern)), [i for group in groups for i in group.index])
+    for name, kind in pattern.kinds.items():
+        index = np.array([i for i in rest if pattern.kind_names[i] == name], dtype=np.int64)
+        if len(index):
+            parts.append((kind, index, nominal_poses(pattern, index, camera_from_dish)))
+    return ink_of(camera, pattern, parts)
 
 
 def _wholly_inside(group: Group) -> Bool:
@@ -207,11 +243,11 @@ def layout(image: NDArray[Any], group: Group, blur_px: float, band_blur_px: floa
     return batch, ring_pixels(image, rings, batch.maps(group.poses, patches), patches, half, band_blur_px, fine)
 
 
-def coarse_fit(image: NDArray[Any], group: Group) -> Coarse:
+def coarse_fit(image: NDArray[Any], group: Group, ink: Ink) -> Coarse:
     """Fit every fourth pixel of a wide band, first all of them, then without outliers."""
     batch, pixels = layout(image, group, FIRST_BLUR_PX, FIRST_BAND_BLUR_PX)
     # one pixel of each block of 2x2, and fewer blocks of large rings
-    pixels = pixels.every(4 * max(1, pixels.s.shape[1] // COARSE_PIXELS))
+    pixels = clear_of_neighbours(pixels.every(4 * max(1, pixels.s.shape[1] // COARSE_PIXELS)), group.index, ink, FIRST_BLUR_PX)
     first = adjust(batch, pixels, group.poses, group.state, Weighting(1.0, 0.0, None), FIRST_STEPS)
     cut = residual_cut(first, pixels)
     second = adjust(batch, pixels, first.poses, first.state, Weighting(1.0, 0.0, cut), COARSE_STEPS, COARSE_ENOUGH)
@@ -246,9 +282,15 @@ def learn(camera: Camera, pattern: Pattern, start: Pose, coarse: list[Coarse], a
     rest = (*shared_tone(coarse), float(np.median(shares)))
     if assumptions.normal_sigma_deg is not None:
         return Shared(pose, noise, max(np.radians(assumptions.normal_sigma_deg), LEAST_NORMAL_SIGMA_RAD), *rest)
-    tilt, covariance = zip(*(free_tilt(c, pose.rotation @ pattern.normal[c.group.index].T) for c in coarse), strict=True)
-    settled = np.concatenate([c.adjusted.converged for c in coarse])
-    return Shared(pose, noise, normal_spread(np.concatenate(tilt)[settled], np.concatenate(covariance)[settled]), *rest)
+    fits = [(c.adjusted, c.group.batch.priors, pose.rotate(pattern.normal[c.group.index])) for c in coarse]
+    return Shared(pose, noise, spread_of_normals(fits, 1.0), *rest)
+
+
+def spread_of_normals(fits: list[tuple[Adjusted, Priors, Array]], inflation: float) -> float:
+    """`normal_spread` over all targets of some fits, each with its priors and the expected normals (T, 3)."""
+    tilt, covariance = zip(*(free_tilt(adjusted, priors, expected) for adjusted, priors, expected in fits), strict=True)
+    settled = np.concatenate([adjusted.converged for adjusted, _, _ in fits])
+    return normal_spread(np.concatenate(tilt)[settled], inflation * np.concatenate(covariance)[settled], FIRST_NORMAL_SIGMA_RAD)
 
 
 def shared_tone(coarse: list[Coarse]) -> tuple[float, float]:
@@ -267,42 +309,7 @@ def shared_tone(coarse: list[Coarse]) -> tuple[float, float]:
     return float(np.clip((data[near] * free[near]).sum() / total, -1.2, 1.2)), float(min(sigma, FIRST_LOG_GAMMA_SIGMA))
 
 
-def free_tilt(coarse: Coarse, expected: Array) -> tuple[Array, Array]:
-    """Tilt (T, 2) of the targets from the expected normals (3, T), about their own axes, and its covariance from data alone."""
-    adjusted = coarse.adjusted
-    posterior = inverse_scaled(adjusted.information)[:, 3:5, 3:5]
-    tips = np.einsum("tji,jt->ti", adjusted.poses.rotation, expected)
-    tilt = np.stack([tips[:, 1], -tips[:, 0]], axis=1)
-    prior = np.einsum("tji,tj->ti", adjusted.poses.rotation, coarse.group.batch.priors.normal)
-    prior_tilt = np.stack([prior[:, 1], -prior[:, 0]], axis=1)
-    eye = np.eye(2) / FIRST_NORMAL_SIGMA_RAD**2
-    # take the first, wide prior out again: what is left is what the pixels alone say
-    data = np.linalg.inv(posterior) - eye
-    data += 1e-9 * np.eye(2) * np.maximum(np.trace(data, axis1=1, axis2=2), 1e-3)[:, None, None]
-    covariance = np.linalg.inv(data)
-    shift = np.einsum("tij,tj->ti", covariance, prior_tilt) / FIRST_NORMAL_SIGMA_RAD**2
-    return tilt + shift, covariance
-
-
-def normal_spread(tilt: Array, covariance: Array) -> float:
-    """Standard deviation (rad, per axis) of true tilts about the surface, by maximum likelihood over all targets.
-
-    Tilts are normal with covariance (data) + spread^2; the few that stray far are held at 4 sigma, so that one bent corner
-    does not loosen the whole surface.
-    """
-    good = np.isfinite(covariance).all(axis=(1, 2)) & (np.abs(tilt) < 2 * FIRST_NORMAL_SIGMA_RAD).all(axis=1)
-    if good.sum() < 4:
-        return float(FIRST_NORMAL_SIGMA_RAD)
-    values, vectors = np.linalg.eigh(covariance[good])
-    along = np.einsum("tji,tj->ti", vectors, tilt[good])
-    grid = np.geomspace(LEAST_NORMAL_SIGMA_RAD, FIRST_NORMAL_SIGMA_RAD, 60)
-    variance = np.maximum(values[None], 1e-14) + grid[:, None, None] ** 2
-    square = np.minimum(along[None] ** 2 / variance, STRAY_SIGMAS**2)
-    likelihood = -0.5 * (square + np.log(variance)).sum(axis=(1, 2))
-    return float(grid[np.argmax(likelihood)])
-
-
-def full_fit(image: NDArray[Any], pattern: Pattern, coarse: Coarse, shared: Shared) -> tuple[Group, Adjusted, RingPixels]:
+def full_fit(image: NDArray[Any], pattern: Pattern, coarse: Coarse, shared: Shared, ink: Ink) -> Fit:
     """Fit all pixels of the band, with the photograph's noise and the surface's normals."""
     group = coarse.group
     expected = shared.camera_from_dish.rotate(pattern.normal[group.index])
@@ -313,6 +320,7 @@ def full_fit(image: NDArray[Any], pattern: Pattern, coarse: Coarse, shared: Shar
     group = replace(group, poses=poses, state=state, batch=replace(group.batch, priors=priors))
     widest = float(np.quantile(group.state.blur_px, 0.9))
     batch, pixels = layout(image, group, widest, widest)
+    pixels = clear_of_neighbours(pixels, group.index, ink, widest)
     cut, pixels = _without_bad_rings(coarse, pixels, shared)
     weighting = Weighting(shared.noise.base, shared.noise.slope, cut)
     adjusted = adjust(batch, pixels, group.poses, group.state, weighting, FULL_STEPS)
@@ -331,7 +339,7 @@ def _prior_sigma(coarse: Coarse, expected: Array, shared: Shared) -> Array:
     Twice STRAY_SIGMAS, because a target seen face on shows the size of its tilt through noise alone at about twice the sigma
     that its normal equations give.
     """
-    tilt, covariance = free_tilt(coarse, expected.T)
+    tilt, covariance = free_tilt(coarse.adjusted, coarse.group.batch.priors, expected)
     width = covariance + shared.normal_sigma_rad**2 * np.eye(2)
     far = np.einsum("ti,tij,tj->t", tilt, np.linalg.inv(width), tilt) > (2 * STRAY_SIGMAS) ** 2
     return np.where(far & coarse.adjusted.converged, FIRST_NORMAL_SIGMA_RAD, shared.normal_sigma_rad)
@@ -347,11 +355,11 @@ def _clear_of_obstacles(batch: Batch, pixels: RingPixels, fit: Adjusted, weighti
     rows = np.flatnonzero((fit.sums.kept.min(axis=1) < OCCLUDED_BELOW) & lost.any(axis=1))
     if not len(rows):
         return fit, pixels
-    blocked = np.zeros_like(pixels.used)
+    blocked = np.zeros_like(pixels.used) if pixels.blocked is None else pixels.blocked.copy()
     for row in rows:
         place = np.stack([pixels.s[row], pixels.t[row]], axis=1) * pixels.patches.scale_px[row]
         far, _ = cKDTree(place[lost[row]]).query(place)
-        blocked[row] = far < OBSTACLE_BLURS * fit.state.blur_px[pixels.target[row]] + 1.0
+        blocked[row] |= far < OBSTACLE_BLURS * fit.state.blur_px[pixels.target[row]] + 1.0
     pixels = replace(pixels, blocked=blocked)
     again = np.zeros(len(fit.poses), bool)
     again[pixels.target[rows]] = True

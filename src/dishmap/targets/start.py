@@ -23,6 +23,8 @@ ELLIPSE_POINTS = 12
 ELLIPSE_SIGMA_PX = 0.25 * ELLIPSE_POINTS**0.5
 ELLIPSE_CUT_PX = 2.5
 ELLIPSE_STEPS = 4
+# Turns about a target's own normal: one circle of a group does not show them, so each step is held to about this.
+SPIN, SPIN_STEP_RAD = 5, 0.1
 RIGID_STEPS = 10
 
 
@@ -98,6 +100,7 @@ def fit_ellipses(batch: Batch, kind: TargetKind, poses: Poses, patches: Patches,
         right = -by_target((weighted @ distance[..., None])[..., 0], points.target, count)
         precision, pull = prior_terms(poses, state, batch.priors)
         normal[:, range(GEOMETRY), range(GEOMETRY)] += precision
+        normal[:, SPIN, SPIN] += 1 / SPIN_STEP_RAD**2
         delta = solve_scaled(normal, right + pull)
         turn = np.linalg.norm(delta[:, 3:6], axis=1, keepdims=True)
         delta[:, 3:6] *= np.minimum(1, 0.3 / np.maximum(turn, 1e-12))

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.camera.model import Camera
-from dishmap.targets.edges import LocalMaps, Patches, Poses, monomials
+from dishmap.targets.edges import SMALLEST_SLOPE, LocalMaps, Patches, Poses, plane_at_offsets
 from dishmap.targets.pattern import TargetKind, bent_print_mm
-from dishmap.targets.pixels import BAND_BLURS, BAND_EXTRA_PX, LARGEST_CURVED, RingPixels, Rings, rings_of
+from dishmap.targets.pixels import BAND_BLURS, BAND_EXTRA_PX, LARGEST_CURVED, RingPixels, Rings, batches, rings_of
 
 Array = NDArray[Any]
 Index = NDArray[np.int64]
@@ -97,8 +97,9 @@ def _gather(image: NDArray[Any], u: Index, v: Index) -> tuple[NDArray[Any], NDAr
     """Grey levels, whether inside the image, and whether at the end of the scale."""
     height, width = image.shape
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    flat = np.clip(v, 0, height - 1) * width + np.clip(u, 0, width - 1)
-    grey = np.take(image.reshape(-1), flat)
+    if not inside.all():
+        u, v = np.clip(u, 0, width - 1), np.clip(v, 0, height - 1)
+    grey = np.take(image.reshape(-1), v * width + u)
     full = np.iinfo(image.dtype).max if image.dtype.kind in "ui" else np.inf
     return grey.astype(np.float32), inside, grey >= full
 
@@ -113,7 +114,7 @@ def _whole_windows(
     scale = patches.scale_px[:, None]
     s, t = (du / scale).astype(np.float32), (dv / scale).astype(np.float32)
     # a window may reach into the next target: only pixels near this one's edges count
-    near = inside & _near_edges(rings, maps, ring, s, t, reach)
+    near = inside & _at_edges(rings, maps, patches, ring, (du, dv), reach).any(axis=0)
     return RingPixels(ring, patches, s, t, grey, near & ~full, (side, side), saturated=_share(near & full, near))
 
 
@@ -121,39 +122,62 @@ def _bands(image: NDArray[Any], rings: Rings, maps: LocalMaps, patches: Patches,
     """Pixels within `reach` of any edge, chosen by 2x2 blocks; every k-th row and column for very large rings."""
     stride = int(np.ceil(2 * half.max() / LARGEST_WINDOW_PX))
     size = int(np.ceil(half.max() / stride / 2)) * 2
-    offsets = (stride * np.arange(-size, size + 1, 2)).astype(np.float32)
+    offsets = stride * np.arange(-size, size + 1, 2, dtype=np.int32)
     dv, du = (x.ravel() for x in np.meshgrid(offsets, offsets, indexing="ij"))
-    scale = patches.scale_px[:, None].astype(np.float32)
-    near = _near_edges(rings, maps, ring, (du + np.float32(0.5 * stride)) / scale, (dv + np.float32(0.5 * stride)) / scale, reach)
-    row, block = np.nonzero(near)
-    counts = near.sum(axis=1)
-    place = 4 * (np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts))
-    shape = (len(near), 4 * max(int(counts.max(initial=0)), 1))
-    out_u, out_v, used = np.zeros(shape, np.int32), np.zeros(shape, np.int32), np.zeros(shape, bool)
-    first = row * shape[1] + place
-    for k in range(4):
-        out_u.reshape(-1)[first + k] = du[block] + stride * (k % 2)
-        out_v.reshape(-1)[first + k] = dv[block] + stride * (k // 2)
-        used.reshape(-1)[first + k] = True
+    # a block is chosen by its middle
+    at = _at_edges(rings, maps, patches, ring, (du + 0.5 * stride, dv + 0.5 * stride), reach)
+    block, used = (np.concatenate(values, axis=1) for values in zip(*map(_places, at), strict=True))
+    ends = tuple(4 * int(end) for end in np.cumsum([_most(near) for near in at]))
+    corners = stride * np.array([[0, 1, 0, 1], [0, 0, 1, 1]], np.int32)
+    out_u, out_v = (np.take(d[:, None] + c, block, axis=0).reshape(len(block), -1) for d, c in zip((du, dv), corners, strict=True))
+    used = np.repeat(used, 4, axis=1)
     anchor = patches.anchor_px.astype(np.int32)
     grey, inside, full = _gather(image, anchor[:, :1] + out_u, anchor[:, 1:] + out_v)
+    scale = patches.scale_px[:, None].astype(np.float32)
     s, t = out_u.astype(np.float32) / scale, out_v.astype(np.float32) / scale
-    return RingPixels(ring, patches, s, t, grey, used & inside & ~full, saturated=_share(used & full, used))
+    clear = rings.gap_mm[ring] / maps.mm_per_px[0][:, None, None] - (reach + stride)
+    return RingPixels(ring, patches, s, t, grey, used & inside & ~full, None, ends, clear, saturated=_share(used & full, used))
+
+
+def _most(chosen: NDArray[Any]) -> int:
+    return max(int(chosen.sum(axis=1).max(initial=0)), 1)
+
+
+def _places(chosen: NDArray[Any]) -> tuple[Index, NDArray[Any]]:
+    """Columns (M, n) of what is chosen in each row, and whether a column stands for anything: rows are padded to the longest."""
+    used = np.arange(_most(chosen)) < chosen.sum(axis=1)[:, None]
+    # what is not used points to the middle of the window
+    out = np.full(used.shape, chosen.shape[1] // 2)
+    out[used] = np.flatnonzero(chosen) % chosen.shape[1]
+    return out, used
 
 
 def _share(some: NDArray[Any], of: NDArray[Any]) -> Array:
     return np.asarray(some.sum(axis=1) / np.maximum(of.sum(axis=1), 1))
 
 
-def _near_edges(rings: Rings, maps: LocalMaps, ring: Index, s: NDArray[Any], t: NDArray[Any], reach_px: float) -> NDArray[Any]:
-    """Where points (M, n) lie within `reach_px` of an edge of their ring; to first order, which is enough to choose pixels."""
-    six = maps.plane.astype(np.float32) @ monomials(s, t, maps.degree)
-    x, y, xu, xv, yu, yv = (six[:, k] for k in range(6))
-    near = np.zeros(s.shape, bool)
-    for c in range(rings.radius_mm.shape[1]):
-        dx, dy = x - rings.center_mm[ring, c, :1], y - rings.center_mm[ring, c, 1:]
-        square = dx * dx + dy * dy
-        gu, gv = dx * xu + dy * yu, dx * xv + dy * yv
-        gap = (rings.radius_mm[ring, c, None] - np.sqrt(square)) ** 2 * square
-        near |= (gap < reach_px**2 * (gu * gu + gv * gv)) & (rings.sign[ring, c, None] != 0)
-    return near & (s * s + t * t < 1)
+def _at_edges(
+    rings: Rings, maps: LocalMaps, patches: Patches, ring: Index, offsets_px: tuple[NDArray[Any], NDArray[Any]], reach_px: float
+) -> NDArray[np.bool_]:
+    """Which (C, M, n) circle's edge is the nearest within `reach_px` of points at offsets (n,), (n,) from each patch's anchor.
+
+    To first order, which is enough to choose pixels.
+    """
+    du, dv = offsets_px
+    center, radius = rings.center_mm, np.where(rings.sign != 0, rings.radius_mm, np.float32(np.inf))
+    out = np.empty((radius.shape[1], len(ring), len(du)), bool)
+    for rows in batches(len(ring), len(du)):
+        x, y, xu, xv, yu, yv = np.moveaxis(plane_at_offsets(maps, patches, rows, du, dv), 1, 0)
+        least = np.full(x.shape, reach_px, np.float32)
+        for c in range(len(out)):
+            if c == 0 or not np.array_equal(center[:, c], center[:, c - 1]):
+                dx, dy = x - center[ring[rows], c, :1], y - center[ring[rows], c, 1:]
+                rho = np.sqrt(dx * dx + dy * dy)
+                gu, gv = dx * xu + dy * yu, dx * xv + dy * yv
+                px_per_mm = rho / np.sqrt(np.maximum(gu * gu + gv * gv, np.float32(SMALLEST_SLOPE)))
+            gap_px = np.abs(radius[ring[rows], c, None] - rho)
+            gap_px *= px_per_mm
+            np.less(gap_px, least, out=out[c, rows])
+            np.minimum(least, gap_px, out=least)
+            out[:c, rows] &= ~out[c, rows]
+    return out & (du * du + dv * dv < patches.scale_px[:, None] ** 2)

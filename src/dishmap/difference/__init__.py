@@ -1,0 +1,1 @@
+"""What changed between two photographs, and the dish rim that both are seen against."""

@@ -1,0 +1,251 @@
+"""What two measured photographs say of how each target moved: from two sets of poses to one Gaussian likelihood per target.
+
+The reference pose of a target is unknown too, and so is the spread of its ink; both are the same in both photographs, so they are
+eliminated target by target. What is then left of an error that both photographs share (a target printed a little off, a normal that
+neither photograph shows, ink that ran) cancels in the change.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dishmap.camera.model import Camera
+from dishmap.difference.response import pose_response
+from dishmap.errors import MeasurementError
+from dishmap.targets.pattern import Pattern
+from dishmap.targets.pose import TargetPoses
+from dishmap.transforms import Pose, rotation_from_vector
+
+Array = NDArray[Any]
+Index = NDArray[np.int64]
+
+# A rigid motion has six parameters and a target gives three; three targets leave something to check.
+LEAST_TARGETS = 3
+ALIGN_STEPS = 30
+# Weights of the first alignment fall beyond this many median distances.
+ALIGN_CUT = 4.0
+# Turns that the pixels do not show are held by this, so that matrices stay regular; far beyond any change of a surface.
+FREE_TURN_RAD = 1.0
+
+
+@dataclass(frozen=True)
+class TargetChanges:
+    """Changes of N targets seen in both states, in coordinates where a rigid motion `moved` has been taken out.
+
+    index: place in the pattern; ids; rotation (N, 3, 3): camera_from_target in the reference, moved. The log-likelihood of a true
+    change x = (move along camera axes in mm, turn about target axes in rad) is score . x - x . information x / 2 with
+    information (N, 6, 6) and score (N, 6). by_strain (N, 6, 3): change that a strain xx, yy, xy of the print looks like; by_focal
+    (N, 6): the same for a focal length that grew, per unit; by_calibration (N, 6, P): what is left of the calibration's error in a
+    difference. moved: camera_from_camera rigid motion, reference to current; du_dv_px (N, 2): motion of the centre in the image;
+    covariance_du_dv_px2 (N, 2, 2); quality (N,): bits of either photograph.
+    """
+
+    index: Index
+    ids: Index
+    rotation: Array
+    information: Array
+    score: Array
+    by_strain: Array
+    by_focal: Array
+    by_calibration: Array
+    moved: Pose
+    du_dv_px: Array
+    covariance_du_dv_px2: Array
+    quality: Index
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+def combine_frames(frames: list[TargetPoses]) -> TargetPoses:
+    """One measurement from several photographs of the same state by the same fixed camera.
+
+    Likelihoods multiply; the priors on normals and ink count once. Targets that only some frames show are kept. Raises
+    MeasurementError for an empty list.
+    """
+    if not frames:
+        raise MeasurementError("no photograph was given to average")
+    out = frames[0]
+    for other in frames[1:]:
+        out = _merged(out, other)
+    return out
+
+
+def _merged(a: TargetPoses, b: TargetPoses) -> TargetPoses:
+    common, in_a, in_b = np.intersect1d(a.index, b.index, return_indices=True)
+    only = np.setdiff1d(np.arange(len(b)), in_b)
+    shift = _between(_rows(a, in_a), _rows(b, in_b))
+    pull_b = b.pull[in_b] + np.einsum("nij,nj->ni", b.information[in_b], shift)
+    information = a.information.copy()
+    information[in_a] += b.information[in_b]
+    # the new estimate, with a's priors in force: they pull against a.pull
+    posterior = information[in_a] + a.prior[in_a][:, :, None] * np.eye(7) + 1e-12 * np.eye(7)
+    step = np.linalg.solve(posterior, pull_b[..., None])[..., 0]
+    pull = a.pull.copy()
+    pull[in_a] += pull_b - np.einsum("nij,nj->ni", information[in_a], step)
+    position, rotation, offset = a.position_mm.copy(), a.rotation.copy(), a.offset_mm.copy()
+    position[in_a] += step[:, :3]
+    rotation[in_a] = rotation[in_a] @ rotation_from_vector(step[:, 3:6])
+    offset[in_a] += step[:, 6]
+    covariance = a.covariance.copy()
+    covariance[in_a] = np.linalg.inv(posterior)[:, :6, :6]
+    quality = a.quality.copy()
+    quality[in_a] |= b.quality[in_b]
+    inside = {
+        "position_mm": position,
+        "rotation": rotation,
+        "normal": rotation[..., 2],
+        "offset_mm": offset,
+        "information": information,
+        "pull": pull,
+        "covariance": covariance,
+        "sigma_normal_rad": np.sqrt(covariance[:, 3, 3] + covariance[:, 4, 4]),
+        "quality": quality,
+        **_averaged_centers(a, b, in_a, in_b),
+    }
+    columns: dict[str, Any] = {
+        name: np.concatenate([inside.get(name, getattr(a, name)), getattr(b, name)[only]]) for name in TARGET_COLUMNS
+    }
+    order = np.argsort(columns["index"])
+    return replace(a, **{name: values[order] for name, values in columns.items()})
+
+
+# The fields of TargetPoses with one row for each target.
+TARGET_COLUMNS = (
+    *("index", "ids", "position_mm", "normal", "rotation", "covariance", "information", "pull", "prior", "center_px", "covariance_px2"),
+    *("sigma_normal_rad", "calibration_jacobian", "blur_px", "offset_mm", "contrast", "noise", "kept", "quality"),
+)
+
+
+def _averaged_centers(a: TargetPoses, b: TargetPoses, in_a: Index, in_b: Index) -> dict[str, Array]:
+    center, covariance = a.center_px.copy(), a.covariance_px2.copy()
+    first, second = np.linalg.inv(a.covariance_px2[in_a]), np.linalg.inv(b.covariance_px2[in_b])
+    both = np.linalg.inv(first + second)
+    covariance[in_a] = both
+    center[in_a] = np.einsum("nij,nj->ni", both @ first, a.center_px[in_a]) + np.einsum("nij,nj->ni", both @ second, b.center_px[in_b])
+    return {"center_px": center, "covariance_px2": covariance}
+
+
+def _rows(poses: TargetPoses, rows: Index) -> TargetPoses:
+    columns: dict[str, Any] = {name: getattr(poses, name)[rows] for name in TARGET_COLUMNS}
+    return replace(poses, **columns)
+
+
+def _between(a: TargetPoses, b: TargetPoses) -> Array:
+    """From poses a to poses b (N, 7): move along camera axes, turn about target axes, edge offset."""
+    turn = small_turn(np.swapaxes(a.rotation, 1, 2) @ b.rotation)
+    return np.concatenate([b.position_mm - a.position_mm, turn, (b.offset_mm - a.offset_mm)[:, None]], axis=1)
+
+
+def small_turn(rotation: Array) -> Array:
+    """Rotation vectors (N, 3) of rotations (N, 3, 3) under half a turn."""
+    skew = 0.5 * np.stack(
+        [rotation[:, 2, 1] - rotation[:, 1, 2], rotation[:, 0, 2] - rotation[:, 2, 0], rotation[:, 1, 0] - rotation[:, 0, 1]], axis=-1
+    )
+    sine = np.linalg.norm(skew, axis=1, keepdims=True)
+    angle = np.arctan2(sine, 0.5 * (np.trace(rotation, axis1=1, axis2=2)[:, None] - 1))
+    return skew * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0)
+
+
+def rigid_alignment(reference_mm: Array, current_mm: Array, covariance_mm2: Array) -> Pose:
+    """The rigid motion that takes points (N, 3) nearly onto others, robust to some that moved on their own.
+
+    covariance_mm2 (N, 3, 3) of the differences. Gauss-Newton with weights that fall with the distance; the start is Kabsch's.
+    Raises MeasurementError for fewer than LEAST_TARGETS points.
+    """
+    if len(reference_mm) < LEAST_TARGETS:
+        raise MeasurementError(
+            f"only {len(reference_mm)} targets were measured in both photographs; a difference needs at least {LEAST_TARGETS}"
+        )
+    information = np.linalg.inv(covariance_mm2)
+    weight = np.ones(len(reference_mm))
+    pose = _kabsch(reference_mm, current_mm)
+    for _ in range(ALIGN_STEPS):
+        at = pose.apply(reference_mm)
+        gap = current_mm - at
+        columns = np.zeros((len(at), 3, 6))
+        columns[:, :, :3] = np.eye(3)
+        columns[:, :, 3:] = _minus_cross(at - at.mean(axis=0))
+        weighted = np.swapaxes(columns, 1, 2) @ (information * weight[:, None, None])
+        step = np.linalg.solve((weighted @ columns).sum(axis=0), (weighted @ gap[..., None]).sum(axis=0)[:, 0])
+        middle = at.mean(axis=0)
+        turn = rotation_from_vector(step[3:])
+        pose = Pose(turn, middle + step[:3] - turn @ middle) @ pose
+        distance = np.sqrt(np.einsum("ni,nij,nj->n", gap, information, gap))
+        cut = ALIGN_CUT * max(float(np.median(distance)), 1e-9)
+        weight = np.clip(1 - (distance / cut) ** 2, 0, None) ** 2
+        if np.linalg.norm(step[:3]) < 1e-9 and np.linalg.norm(step[3:]) < 1e-12:
+            break
+    # products of rotations drift from orthonormal by rounding
+    left, _, right = np.linalg.svd(pose.rotation)
+    return Pose(left @ right, pose.translation_mm)
+
+
+def _minus_cross(points: Array) -> Array:
+    """Matrices (N, 3, 3) with which a small turn moves points about the origin."""
+    out = np.zeros((len(points), 3, 3))
+    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = points[:, 2], -points[:, 1], points[:, 0]
+    return np.asarray(out - np.swapaxes(out, 1, 2))
+
+
+def _kabsch(a: Array, b: Array) -> Pose:
+    """Least-squares rigid motion from points a to points b (Kabsch 1976)."""
+    middle_a, middle_b = a.mean(axis=0), b.mean(axis=0)
+    u, _, vt = np.linalg.svd((a - middle_a).T @ (b - middle_b))
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
+    rotation = vt.T @ sign @ u.T
+    return Pose(rotation, middle_b - rotation @ middle_a)
+
+
+def target_changes(reference: TargetPoses, current: TargetPoses, camera: Camera, pattern: Pattern) -> TargetChanges:
+    """How every target that both states show moved. Raises MeasurementError when they have fewer than LEAST_TARGETS in common."""
+    _, in_reference, in_current = np.intersect1d(reference.index, current.index, return_indices=True)
+    before, after = _rows(reference, in_reference), _rows(current, in_current)
+    covariance = before.covariance[:, :3, :3] + after.covariance[:, :3, :3]
+    moved = rigid_alignment(before.position_mm, after.position_mm, covariance)
+    aligned = replace(before, position_mm=moved.apply(before.position_mm), rotation=moved.rotation @ before.rotation)
+    turned = np.zeros((7, 7))
+    turned[:3, :3], turned[3:, 3:] = moved.rotation, np.eye(4)
+    information, score = _eliminated(before, after, _between(aligned, after), turned)
+    camera_before, _ = pose_response(camera, pattern, before.index, reference.camera_from_dish)
+    camera_after, strain = pose_response(camera, pattern, before.index, moved @ reference.camera_from_dish)
+    focal = -camera_after[..., :2] @ camera.parameters[:2]
+    return TargetChanges(
+        index=before.index,
+        ids=before.ids,
+        rotation=aligned.rotation,
+        information=information,
+        score=score,
+        by_strain=strain,
+        by_focal=focal,
+        by_calibration=camera_after - turned[:6, :6] @ camera_before,
+        moved=moved,
+        du_dv_px=after.center_px - before.center_px,
+        covariance_du_dv_px2=before.covariance_px2 + after.covariance_px2,
+        quality=before.quality | after.quality,
+    )
+
+
+def _eliminated(before: TargetPoses, after: TargetPoses, between: Array, turned: Array) -> tuple[Array, Array]:
+    """Information (N, 6, 6) and score (N, 6) of the change, the reference's own pose and the ink's spread eliminated.
+
+    With e the error of the reference estimate (pose and edge offset) and y = x - between that of the change, the photographs say
+    -e A e / 2 - (e + y) B (e + y) / 2 + p (e + y), A and B their informations (A with its priors, at whose balance e = 0) and p the
+    pull of the current one. Over the best e this is -y (B - B M B) y / 2 + (p - B M p) y, M = (A + B)^-1.
+    """
+    held = np.eye(7) * (before.prior[:, :, None] + 1e-12)
+    a = turned @ (before.information + held) @ turned.T
+    b = after.information
+    b_m = b @ np.linalg.inv(a + b)
+    information = b - b_m @ b
+    score = after.pull - np.einsum("nij,nj->ni", b_m, after.pull)
+    # edge offsets do not change between the photographs, so the last part of y is known
+    offset = -between[:, 6]
+    change = information[:, :6, :6]
+    score = score[:, :6] - information[:, :6, 6] * offset[:, None]
+    change = 0.5 * (change + np.swapaxes(change, 1, 2))
+    return change, score + np.einsum("nij,nj->ni", change, between[:, :6])

@@ -1,0 +1,305 @@
+"""From target changes to what the surface did: hypotheses weighed, outliers put aside, sizes learnt."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from dishmap.camera.model import Camera
+from dishmap.difference.changes import LEAST_TARGETS, TargetChanges
+from dishmap.difference.joint import RANGES, Evidence, Posterior, Sizes, determined, learn_sizes, posterior
+from dishmap.difference.model import BLOCKS, WAYS, Columns, Surfaces, columns_of, curved_change, smooth_kernel, surfaces_of
+from dishmap.difference.priors import Priors
+from dishmap.errors import InputError, MeasurementError
+from dishmap.targets.pattern import Pattern
+from dishmap.transforms import Pose
+
+Array = NDArray[Any]
+Bool = NDArray[Any]
+
+# Correlation lengths of the normal displacement that are weighed, in radii of the surface.
+LENGTHS = (0.3, 0.6, 1.2)
+# Hypotheses whose evidence is lower than the best one's by this many nats do not count.
+LEAST_LOG_WEIGHT = 7.0
+# Strain with which the size of prints says nothing.
+FREE_STRAIN = 0.05
+# A change of scale of the whole picture beyond this may as well be an expansion, when nothing is said of it.
+NOTED_SCALE = 1e-3
+# Passes of learning and of taking curvature into account.
+PASSES = 3
+# Screening: sizes wide enough for any surface, and how much worse than most targets (this quantile) one may fit, in chi-square; first
+# coarsely, then under the best hypothesis. Six degrees of freedom have chi-square 7.8 at that quantile, 39 once in a million.
+SCREEN = Sizes(normal_mm=1.0, slide_strain=1e-3, rough_mm=1.0, print_strain=1e-3)
+SCREEN_ROUNDS, SCREEN_RATIO, FIT_RATIO = 6, 30.0, 5.0
+LIKE_MOST, USUAL_MISFIT = 0.75, 7.8
+LEAST_INFORMATION = 1e-9
+OUTLIER_ROUNDS = 3
+# Residuals count as larger than claimed from this many standard deviations of their mean square; with this many degrees of freedom or more.
+NOTED_MISFIT, LEAST_FREEDOM = 4.0, 12.0
+# Slide beyond what a way says, as a mean strain: more than this is another way of moving.
+LARGEST_SLIDE = 5e-6
+# How far the surface may have moved when its slides say nothing of it.
+FREE_NORMAL_MM = 1.0
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One way in which the surface may have moved, fitted: slides, correlation length, columns, posterior, curvature and log weight."""
+
+    way: str
+    length_mm: float
+    columns: Columns
+    posterior: Posterior
+    log_weight: float
+    converged: bool
+
+
+@dataclass(frozen=True)
+class JointEstimate:
+    """Hypotheses that count, with weights (H,) that sum to one, and what was found on the way.
+
+    kept (N,): 1 for targets that were used, 0 for outliers; misfit (N,): chi-square of each target under the best hypothesis; noise_factor:
+    variance of the residuals over the claimed one, by which covariances were enlarged (at least 1); expansion: mean and sigma assumed,
+    per unit; learnt: names of the sizes that were learnt; parts_named: rigid parts define the rigid motion.
+    """
+
+    hypotheses: tuple[Hypothesis, ...]
+    weights: Array
+    kept: Array
+    misfit: Array
+    noise_factor: float
+    expansion: tuple[float, float]
+    learnt: tuple[str, ...]
+    parts_named: bool
+    surfaces: Surfaces
+
+
+def joint_estimate(
+    changes: TargetChanges,
+    pattern: Pattern,
+    camera: Camera,
+    camera_from_dish: Pose,
+    priors: Priors,
+    progress: Callable[[int, int], None] | None = None,
+) -> JointEstimate:
+    """Weigh all ways in which the surface may have moved. camera_from_dish is that of the reference."""
+    return _Problem(changes, pattern, camera, camera_from_dish, priors).solve(progress or (lambda done, total: None))
+
+
+class _Problem:
+    """The parts of one estimate that its steps share."""
+
+    def __init__(self, changes: TargetChanges, pattern: Pattern, camera: Camera, camera_from_dish: Pose, priors: Priors) -> None:
+        self.changes, self.pattern, self.camera, self.priors = changes, pattern, camera, priors
+        self.camera_from_dish = camera_from_dish
+        self.to_camera = (changes.moved @ camera_from_dish).rotation
+        self.xy = pattern.center_mm[changes.index, :2]
+        self.surfaces = surfaces_of(pattern, changes.index)
+        near = cKDTree(self.xy).query(self.xy, k=2)[0][:, 1] if len(self.xy) > 1 else np.array([1.0])
+        self.rough_length_mm = 0.5 * float(np.median(near))
+        self.expansion = _expansion(changes, camera_from_dish, pattern, priors)
+        self.start, self.learnt = _start_sizes(priors, self.expansion[1])
+        self.kept = np.ones(len(changes))
+        self.scale = 1.0
+        self.hub = self._hub()
+
+    def columns(self, way: str, length: float) -> Columns:
+        """Columns of all unknowns for one way of following and one correlation length."""
+        kernel = smooth_kernel(self.surfaces, length)
+        out = columns_of(self.changes, self.pattern, self.camera, self.camera_from_dish, self.surfaces, kernel, way)
+        mean = out.mean.copy()
+        mean[out.block == BLOCKS.index("expansion")] = self.expansion[0]
+        return replace(out, mean=mean)
+
+    def evidence(self, columns: Columns, at: Posterior | None = None, everything: bool = False) -> Evidence:
+        """The weighted likelihoods, linearised at a posterior; with `everything`, outliers too."""
+        weight = (np.ones(len(self.changes)) if everything else self.kept) / self.scale
+        information, score = self.changes.information * weight[:, None, None], self.changes.score * weight[:, None]
+        constant = 0.0
+        if at is not None:
+            curved = curved_change(columns, self.pattern, self.changes.index, self.to_camera, self.changes.by_strain, at.mean)
+            shift = np.einsum("nij,nj->ni", information, curved)
+            constant = float((curved * (score - 0.5 * shift)).sum())
+            score = score - shift
+        return Evidence(information, score, constant, columns, self.rough_length_mm, self.hub)
+
+    def _hub(self) -> Array:
+        """Places in `changes` of the targets on rigid parts."""
+        if not self.priors.rigid_ids:
+            return np.zeros(0, np.int64)
+        unknown = sorted(set(self.priors.rigid_ids) - set(self.pattern.ids.tolist()))
+        if unknown:
+            raise InputError(f"target {unknown[0]} is named as part of a rigid part, but the pattern has no such target")
+        hub = np.flatnonzero(np.isin(self.changes.ids, self.priors.rigid_ids))
+        if len(hub) < LEAST_TARGETS:
+            raise MeasurementError(
+                f"only {len(hub)} targets on rigid parts were measured in both photographs; at least {LEAST_TARGETS} are needed"
+            )
+        return hub
+
+    def screen(self) -> None:
+        """Put aside targets that no surface could have carried along, before anything is learnt."""
+        columns = self.columns("any", LENGTHS[0] * self.surfaces.fields.radius_mm)
+        wide = replace(SCREEN, expansion=self.expansion[1], focal=self.priors.focal_drift)
+        found: Posterior | None = None
+        for _ in range(SCREEN_ROUNDS):
+            evidence = self.evidence(columns, found)
+            found = posterior(evidence, wide)
+            kept = _not_outlying(_misfit(evidence, found), SCREEN_RATIO)
+            if np.array_equal(kept, self.kept):
+                break
+            self.kept = kept
+
+    def put_aside(self, best: Hypothesis) -> bool:
+        """Put aside targets that do not fit the best hypothesis; True when that changed any."""
+        kept = np.minimum(_not_outlying(_misfit(self.evidence(best.columns, best.posterior), best.posterior), FIT_RATIO), self.kept)
+        changed = not np.array_equal(kept, self.kept)
+        self.kept = kept
+        return changed
+
+    def fit(self, way: str, length: float, start: Sizes | None = None) -> Hypothesis:
+        """Fit one way of moving."""
+        columns, sizes = self.columns(way, length), start or self.start
+        names = list(self.learnt)
+        if way == "any":
+            # what cannot be told from slides is not smoothed away
+            names = [n for n in names if n != "normal_mm"]
+            sizes = replace(sizes, normal_mm=max(sizes.normal_mm, FREE_NORMAL_MM))
+        bounds = {} if way == "any" else {"slide_strain": LARGEST_SLIDE}
+        found = learn_sizes(lambda at: self.evidence(columns, at), sizes, names, bounds)
+        return Hypothesis(way, length, columns, found.posterior, found.log_weight, found.converged)
+
+    def solve(self, tell: Callable[[int, int], None]) -> JointEstimate:
+        """Fit all ways that are left open, first at the middle length, and weigh them."""
+        self.screen()
+        ways, lengths = self._ways(), self._lengths()
+        middle = lengths[len(lengths) // 2]
+        total = len(ways) + len(lengths)
+        every = []
+        for way in ways:
+            every.append(self.fit(way, middle))
+            tell(len(every), total)
+        every = self._without_outliers(_finite(every), middle)
+        best = max(h.log_weight for h in every)
+        for length in lengths:
+            near = [h for h in every if h.length_mm == middle and h.way != "any" and h.log_weight > best - 3 * LEAST_LOG_WEIGHT]
+            every += [self.fit(h.way, length, h.posterior.sizes) for h in near if length != middle]
+            tell(len(ways) + lengths.index(length) + 1, total)
+        every = _finite(every)
+        top = max(h.log_weight for h in every)
+        every = [h for h in every if h.log_weight > top - LEAST_LOG_WEIGHT]
+        weights = np.exp([h.log_weight - top for h in every])
+        one = max(every, key=lambda h: h.log_weight)
+        misfit = _misfit(self.evidence(one.columns, one.posterior, everything=True), one.posterior)
+        return JointEstimate(
+            hypotheses=tuple(every),
+            weights=weights / weights.sum(),
+            kept=self.kept,
+            misfit=misfit,
+            noise_factor=self.scale,
+            expansion=self.expansion,
+            learnt=self.learnt,
+            parts_named=bool(self.priors.rigid_ids),
+            surfaces=self.surfaces,
+        )
+
+    def _without_outliers(self, every: list[Hypothesis], length: float) -> list[Hypothesis]:
+        """Put targets aside that do not fit the best hypothesis, and enlarge the noise where the rest do not fit as claimed."""
+        for _ in range(OUTLIER_ROUNDS):
+            best = max(every, key=lambda h: h.log_weight)
+            changed = self.put_aside(best)
+            noisier = self.enlarge(best)
+            if not (changed or noisier):
+                break
+            every = _finite([self.fit(h.way, length, h.posterior.sizes) for h in every])
+        return every
+
+    def enlarge(self, best: Hypothesis) -> bool:
+        """Scale the noise up where residuals are larger than claimed; True when that changed anything."""
+        evidence = self.evidence(best.columns, best.posterior)
+        freedom = 6 * self.kept.sum() - determined(evidence, best.posterior)
+        if freedom < LEAST_FREEDOM:
+            return False
+        factor = float(_misfit(evidence, best.posterior).sum()) / freedom
+        if factor < 1 + NOTED_MISFIT * np.sqrt(2 / freedom):
+            return False
+        self.scale *= factor
+        return True
+
+    def _lengths(self) -> list[float]:
+        radius = self.surfaces.fields.radius_mm
+        if self.priors.still:
+            return [radius]
+        return [self.priors.length_mm] if self.priors.length_mm is not None else [r * radius for r in LENGTHS]
+
+    def _ways(self) -> tuple[str, ...]:
+        if self.priors.still:
+            return ("normal",)
+        if self.priors.slide is not None:
+            return (self.priors.slide,)
+        if self.priors.strain == "free":
+            # without the size of prints nothing tells how points slide: they do what a membrane does
+            return ("least_strain",)
+        # on a plane the slide does not depend on the displacement along the normal
+        return ("normal", "any") if self.pattern.surface.kind == "plane" else tuple(WAYS)
+
+
+def _finite(hypotheses: list[Hypothesis]) -> list[Hypothesis]:
+    """Those with a finite evidence, or all when none has."""
+    good = [h for h in hypotheses if np.isfinite(h.log_weight)]
+    return good or hypotheses
+
+
+def _misfit(evidence: Evidence, found: Posterior) -> Array:
+    """Chi-square (N,) of what is left of each target's change, against the photographs' own covariance; 0 where nothing is used."""
+    at = evidence.columns.change @ found.mean + np.einsum("nij,nj->ni", evidence.columns.local, found.local_mean)
+    left = evidence.score - np.einsum("nij,nj->ni", evidence.information, at)
+    regular = evidence.information + LEAST_INFORMATION * np.eye(6)
+    return np.asarray(np.einsum("ni,ni->n", left, np.linalg.solve(regular, left[..., None])[..., 0]))
+
+
+def _not_outlying(misfit: Array, ratio: float) -> Array:
+    """1 for targets whose misfit is like that of most, 0 for the others."""
+    like_most = max(float(np.quantile(misfit, LIKE_MOST)), USUAL_MISFIT)
+    return np.where(misfit < ratio * like_most, 1.0, 0.0)
+
+
+def _start_sizes(priors: Priors, expansion: float) -> tuple[Sizes, tuple[str, ...]]:
+    values = {name: RANGES[name][0] for name in RANGES}
+    learnt = set(RANGES)
+
+    def fixed(name: str, value: float) -> None:
+        values[name] = value
+        learnt.discard(name)
+
+    if priors.still:
+        for name in ("normal_mm", "slide_strain", "rough_mm"):
+            fixed(name, 0.0)
+    if priors.amplitude_mm is not None:
+        fixed("normal_mm", priors.amplitude_mm)
+    if priors.strain == "rigid":
+        fixed("slide_strain", 0.0)
+        fixed("print_strain", 0.0)
+    elif priors.strain == "free":
+        fixed("print_strain", FREE_STRAIN)
+    elif priors.strain is not None:
+        fixed("slide_strain", float(priors.strain))
+        fixed("print_strain", float(priors.strain))
+    if priors.still and priors.strain is None:
+        fixed("print_strain", 0.0)
+    return Sizes(**values, expansion=expansion, focal=priors.focal_drift), tuple(n for n in RANGES if n in learnt)
+
+
+def _expansion(changes: TargetChanges, camera_from_dish: Pose, pattern: Pattern, priors: Priors) -> tuple[float, float]:
+    """Mean and sigma of the expansion, per unit: as given, or what the change of scale of the whole picture leaves open."""
+    if priors.expansion_ppm is not None:
+        return priors.expansion_ppm[0] * 1e-6, priors.expansion_ppm[1] * 1e-6
+    before = camera_from_dish.apply(pattern.center_mm[changes.index])
+    after = changes.moved.apply(before)
+    scale = float(np.mean(np.linalg.norm(after, axis=1) / np.linalg.norm(before, axis=1))) - 1
+    return 0.0, abs(scale) if abs(scale) > NOTED_SCALE else 0.0
