@@ -36,7 +36,7 @@ MEANING: dict[Quality, str] = {
     Quality.POOR_FIT: "the pixels differ from the model by more than the image's noise explains; sigmas are scaled up",
     Quality.TOO_SMALL: "the smallest printed circle is under 2 px in radius",
     Quality.AMBIGUOUS_NORMAL: "a mirrored normal fits the pixels as well; the one nearer to the pattern's surface is given",
-    Quality.OFF_SURFACE: "the target lies far from the surface through its neighbours",
+    Quality.OFF_SURFACE: "the target lies, or moved, far from the surface through its neighbours",
     Quality.NOT_CONVERGED: "the fit to the pixels did not converge",
     Quality.WEAK_DEPTH: "depth rests on the assumed ink spread (a lone disc), not on the image alone",
     Quality.OUTLIER: "its change fits no smooth motion of the surface; the value is what its neighbours say",

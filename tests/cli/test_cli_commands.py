@@ -245,7 +245,7 @@ def test_demo_compares_with_the_truth(tmp_path: Path, monkeypatch: pytest.Monkey
     done = dishmap("demo", "--out", tmp_path / "demo")
     assert done.exit_code == 0, done.stderr
     names = {path.name for path in (tmp_path / "demo").iterdir()}
-    results = {"points.csv", "points.ply", "surface.json", "summary.json", "report.html"}
+    results = {"points.csv", "points.ply", "surface.json", "summary.json", "report.html", "measurement.npz"}
     assert names == {"photograph.png", "camera.yaml", "pattern.json", "truth.csv", *results}
     assert "130 of 130 targets measured" in done.stdout
     (inside,) = re.findall(r"z \(depth\) mm +[\d.]+ +[\d.]+ +(\d+)%", done.stdout)

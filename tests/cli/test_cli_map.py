@@ -31,7 +31,8 @@ def apart_in_sigmas(folder: Path, other: Path) -> float:
 def test_points_are_where_the_truth_has_them(shot: Path, mapped: tuple[Path, Result]) -> None:
     folder, said = mapped
     assert (said.exit_code, said.stderr) == (0, "")
-    assert {path.name for path in folder.iterdir()} == {"points.csv", "points.ply", "surface.json", "summary.json", "report.html"}
+    made = {"points.csv", "points.ply", "surface.json", "summary.json", "report.html", "measurement.npz"}
+    assert {path.name for path in folder.iterdir()} == made
     points, truth = read_points(folder / "points.csv"), read_truth(shot / "truth.csv")["ref.png"]
     assert points.ids.tolist() == truth.ids.tolist()
     assert np.abs((points.position_mm - truth.center_mm) / points.sigma_mm).max() < FARTHEST_SIGMAS

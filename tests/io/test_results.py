@@ -256,7 +256,7 @@ def test_files_of_a_map(photograph: tuple[np.ndarray, Map], tmp_path: Path) -> N
     craft = Pose.from_rotation_vector([0.1, 0.2, 0.3], [1.0, 2.0, 3.0])
     guess = PoseGuess(Pose.from_rotation_vector([np.pi, 0, 0], [0.0, 0.0, 420.0]))
     files = result_files(result, Provenance(CAMERA, {"photograph": source}, guess, spacecraft_from_camera=craft, seconds={"map": 0.1}))
-    assert set(files) == {"points.csv", "points.ply", "surface.json", "summary.json", SPACECRAFT_FILE}
+    assert set(files) == {"points.csv", "points.ply", "surface.json", "summary.json", "measurement.npz", SPACECRAFT_FILE}
     summary, surface = json.loads(files["summary.json"]), json.loads(files["surface.json"])
     # of the text `abc`, from FIPS 180-2
     assert summary["inputs"]["photograph"]["sha256"] == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"

@@ -28,8 +28,8 @@ LEAST_TARGETS = 3
 ALIGN_STEPS = 30
 # Weights of the first alignment fall beyond this many median distances.
 ALIGN_CUT = 4.0
-# Turns that the pixels do not show are held by this, so that matrices stay regular; far beyond any change of a surface.
-FREE_TURN_RAD = 1.0
+# Added to information so that matrices of what nothing shows (the turn of a lone ring) stay regular: a sigma of 10^6 mm or rad.
+LEAST_PRIOR = 1e-12
 
 
 @dataclass(frozen=True)
@@ -76,14 +76,14 @@ def combine_frames(frames: list[TargetPoses]) -> TargetPoses:
 
 
 def _merged(a: TargetPoses, b: TargetPoses) -> TargetPoses:
-    common, in_a, in_b = np.intersect1d(a.index, b.index, return_indices=True)
+    _, in_a, in_b = np.intersect1d(a.index, b.index, return_indices=True)
     only = np.setdiff1d(np.arange(len(b)), in_b)
     shift = _between(_rows(a, in_a), _rows(b, in_b))
     pull_b = b.pull[in_b] + np.einsum("nij,nj->ni", b.information[in_b], shift)
     information = a.information.copy()
     information[in_a] += b.information[in_b]
     # the new estimate, with a's priors in force: they pull against a.pull
-    posterior = information[in_a] + a.prior[in_a][:, :, None] * np.eye(7) + 1e-12 * np.eye(7)
+    posterior = information[in_a] + a.prior[in_a][:, :, None] * np.eye(7) + LEAST_PRIOR * np.eye(7)
     step = np.linalg.solve(posterior, pull_b[..., None])[..., 0]
     pull = a.pull.copy()
     pull[in_a] += pull_b - np.einsum("nij,nj->ni", information[in_a], step)
@@ -162,22 +162,18 @@ def rigid_alignment(reference_mm: Array, current_mm: Array, covariance_mm2: Arra
             f"only {len(reference_mm)} targets were measured in both photographs; a difference needs at least {LEAST_TARGETS}"
         )
     information = np.linalg.inv(covariance_mm2)
-    weight = np.ones(len(reference_mm))
     pose = _kabsch(reference_mm, current_mm)
     for _ in range(ALIGN_STEPS):
         at = pose.apply(reference_mm)
-        gap = current_mm - at
-        columns = np.zeros((len(at), 3, 6))
-        columns[:, :, :3] = np.eye(3)
-        columns[:, :, 3:] = _minus_cross(at - at.mean(axis=0))
-        weighted = np.swapaxes(columns, 1, 2) @ (information * weight[:, None, None])
-        step = np.linalg.solve((weighted @ columns).sum(axis=0), (weighted @ gap[..., None]).sum(axis=0)[:, 0])
-        middle = at.mean(axis=0)
-        turn = rotation_from_vector(step[3:])
-        pose = Pose(turn, middle + step[:3] - turn @ middle) @ pose
+        gap, middle = current_mm - at, at.mean(axis=0)
         distance = np.sqrt(np.einsum("ni,nij,nj->n", gap, information, gap))
         cut = ALIGN_CUT * max(float(np.median(distance)), 1e-9)
         weight = np.clip(1 - (distance / cut) ** 2, 0, None) ** 2
+        columns = np.concatenate([np.broadcast_to(np.eye(3), (len(at), 3, 3)), _minus_cross(at - middle)], axis=2)
+        weighted = np.swapaxes(columns, 1, 2) @ (information * weight[:, None, None])
+        step = np.linalg.solve((weighted @ columns).sum(axis=0), (weighted @ gap[..., None]).sum(axis=0)[:, 0])
+        turn = rotation_from_vector(step[3:])
+        pose = Pose(turn, middle + step[:3] - turn @ middle) @ pose
         if np.linalg.norm(step[:3]) < 1e-9 and np.linalg.norm(step[3:]) < 1e-12:
             break
     # products of rotations drift from orthonormal by rounding
@@ -230,6 +226,13 @@ def target_changes(reference: TargetPoses, current: TargetPoses, camera: Camera,
     )
 
 
+def changed_information(before: Array, after: Array, prior: Array) -> Array:
+    """Information (N, 6, 6) on the change from those of two photographs (N, 7, 7) and the priors (N, 7) of the reference."""
+    a = before + np.eye(7) * (prior[:, :, None] + LEAST_PRIOR)
+    change = after - after @ np.linalg.inv(a + after) @ after
+    return np.asarray(0.5 * (change + np.swapaxes(change, 1, 2)))[:, :6, :6]
+
+
 def _eliminated(before: TargetPoses, after: TargetPoses, between: Array, turned: Array) -> tuple[Array, Array]:
     """Information (N, 6, 6) and score (N, 6) of the change, the reference's own pose and the ink's spread eliminated.
 
@@ -237,7 +240,7 @@ def _eliminated(before: TargetPoses, after: TargetPoses, between: Array, turned:
     -e A e / 2 - (e + y) B (e + y) / 2 + p (e + y), A and B their informations (A with its priors, at whose balance e = 0) and p the
     pull of the current one. Over the best e this is -y (B - B M B) y / 2 + (p - B M p) y, M = (A + B)^-1.
     """
-    held = np.eye(7) * (before.prior[:, :, None] + 1e-12)
+    held = np.eye(7) * (before.prior[:, :, None] + LEAST_PRIOR)
     a = turned @ (before.information + held) @ turned.T
     b = after.information
     b_m = b @ np.linalg.inv(a + b)

@@ -192,7 +192,7 @@ class _Frame:
 
     def _along(self, rows: Array) -> Array:
         """How functionals (Q, 3 N) of the displacement take a rise of each target along its normal (Q, N)."""
-        return np.einsum("qni,ni->qn", rows.reshape(len(rows), -1, 3), self.normal)
+        return np.einsum("qni,ni->qn", rows.reshape(len(rows), len(self.points), 3), self.normal)
 
 
 @dataclass(frozen=True)
@@ -324,7 +324,9 @@ def _assembled(
         sigma_shape_mm=np.sqrt(variance[shape]),
         du_dv_px=changes.du_dv_px,
         misfit=np.sqrt(estimate.misfit / DIRECTIONS),
-        quality=changes.quality | np.where(estimate.kept > 0, 0, int(Quality.OUTLIER)),
+        quality=changes.quality
+        | np.where(estimate.kept > 0, 0, int(Quality.OUTLIER))
+        | np.where(estimate.loose, int(Quality.OFF_SURFACE), 0),
         shape_factor=mixed.factor[shape],
         shape_own_mm2=mixed.own[shape],
         rigid_motion=frame.motion(mixed.mean[rigid]),

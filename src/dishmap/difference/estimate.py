@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from dishmap.camera.model import Camera
 from dishmap.difference.changes import LEAST_TARGETS, TargetChanges
-from dishmap.difference.joint import RANGES, Evidence, Posterior, Sizes, determined, learn_sizes, posterior
+from dishmap.difference.joint import RANGES, Evidence, Posterior, Sizes, determined, learn_sizes, misfit, posterior
 from dishmap.difference.model import BLOCKS, WAYS, Columns, Surfaces, columns_of, curved_change, smooth_kernel, surfaces_of
 from dishmap.difference.priors import Priors
 from dishmap.errors import InputError, MeasurementError
@@ -35,12 +35,11 @@ PASSES = 3
 # Screening: sizes wide enough for any surface, and how much worse than most targets (this quantile) one may fit, in chi-square; first
 # coarsely, then under the best hypothesis. Six degrees of freedom have chi-square 7.8 at that quantile, 39 once in a million.
 SCREEN = Sizes(normal_mm=1.0, slide_strain=1e-3, rough_mm=1.0, print_strain=1e-3)
-SCREEN_ROUNDS, SCREEN_RATIO, FIT_RATIO = 6, 30.0, 5.0
+SCREEN_ROUNDS, SCREEN_STEP, SCREEN_RATIO, FIT_RATIO = 20, 4.0, 30.0, 5.0
 LIKE_MOST, USUAL_MISFIT = 0.75, 7.8
-LEAST_INFORMATION = 1e-9
-OUTLIER_ROUNDS = 3
+OUTLIER_ROUNDS = 5
 # Residuals count as larger than claimed from this many standard deviations of their mean square; with this many degrees of freedom or more.
-NOTED_MISFIT, LEAST_FREEDOM = 4.0, 12.0
+NOTED_MISFIT, LEAST_FREEDOM, SETTLED_SCALE = 4.0, 12.0, 0.05
 # Slide beyond what a way says, as a mean strain: more than this is another way of moving.
 LARGEST_SLIDE = 5e-6
 # How far the surface may have moved when its slides say nothing of it.
@@ -63,14 +62,16 @@ class Hypothesis:
 class JointEstimate:
     """Hypotheses that count, with weights (H,) that sum to one, and what was found on the way.
 
-    kept (N,): 1 for targets that were used, 0 for outliers; misfit (N,): chi-square of each target under the best hypothesis; noise_factor:
-    variance of the residuals over the claimed one, by which covariances were enlarged (at least 1); expansion: mean and sigma assumed,
-    per unit; learnt: names of the sizes that were learnt; parts_named: rigid parts define the rigid motion.
+    kept (N,): 1 for targets that were used, 0 for outliers; loose (N,): targets that moved on their own; misfit (N,): chi-square of each
+    target under the best hypothesis; noise_factor: variance of the residuals over the claimed one, by which covariances were enlarged (at
+    least 1); expansion: mean and sigma assumed, per unit; learnt: names of the sizes that were learnt; parts_named: rigid parts define
+    the rigid motion.
     """
 
     hypotheses: tuple[Hypothesis, ...]
     weights: Array
     kept: Array
+    loose: Array
     misfit: Array
     noise_factor: float
     expansion: tuple[float, float]
@@ -105,6 +106,7 @@ class _Problem:
         self.expansion = _expansion(changes, camera_from_dish, pattern, priors)
         self.start, self.learnt = _start_sizes(priors, self.expansion[1])
         self.kept = np.ones(len(changes))
+        self.loose = np.zeros(len(changes), bool)
         self.scale = 1.0
         self.hub = self._hub()
 
@@ -126,7 +128,7 @@ class _Problem:
             shift = np.einsum("nij,nj->ni", information, curved)
             constant = float((curved * (score - 0.5 * shift)).sum())
             score = score - shift
-        return Evidence(information, score, constant, columns, self.rough_length_mm, self.hub)
+        return Evidence(information, score, constant, columns, self.rough_length_mm, self.hub, self.loose)
 
     def _hub(self) -> Array:
         """Places in `changes` of the targets on rigid parts."""
@@ -143,23 +145,37 @@ class _Problem:
         return hub
 
     def screen(self) -> None:
-        """Put aside targets that no surface could have carried along, before anything is learnt."""
+        """Put aside targets that no surface could have carried along, before anything is learnt.
+
+        An outlier drags its neighbours along at first, so the limit is lowered step by step from the worst misfit to the final one,
+        and every target is judged anew at each (Blake and Zisserman 1987, graduated non-convexity).
+        """
         columns = self.columns("any", LENGTHS[0] * self.surfaces.fields.radius_mm)
         wide = replace(SCREEN, expansion=self.expansion[1], focal=self.priors.focal_drift)
-        found: Posterior | None = None
+        found, limit = posterior(self.evidence(columns), wide), np.inf
         for _ in range(SCREEN_ROUNDS):
-            evidence = self.evidence(columns, found)
-            found = posterior(evidence, wide)
-            kept = _not_outlying(_misfit(evidence, found), SCREEN_RATIO)
-            if np.array_equal(kept, self.kept):
+            values = misfit(self.evidence(columns, found, everything=True), found)
+            final = SCREEN_RATIO * _like_most(values)
+            limit = max(min(limit / SCREEN_STEP, float(values.max()) / SCREEN_STEP), final)
+            kept = np.where(values < limit, 1.0, 0.0)
+            if limit == final and np.array_equal(kept, self.kept):
                 break
             self.kept = kept
+            found = posterior(self.evidence(columns, found), wide)
 
     def put_aside(self, best: Hypothesis) -> bool:
-        """Put aside targets that do not fit the best hypothesis; True when that changed any."""
-        kept = np.minimum(_not_outlying(_misfit(self.evidence(best.columns, best.posterior), best.posterior), FIT_RATIO), self.kept)
-        changed = not np.array_equal(kept, self.kept)
-        self.kept = kept
+        """Judge every target by the best hypothesis; True when that changed the judgement of any.
+
+        A target that fits once it may rise and lean on its own is kept as loose: a bump of its own, or a label that came off. One that
+        does not fit even so (it moved within the surface, as no surface carries it) is an outlier.
+        """
+        evidence = replace(self.evidence(best.columns, best.posterior, everything=True), loose=np.zeros(len(self.changes), bool))
+        bound = misfit(evidence, best.posterior)
+        free = misfit(replace(evidence, loose=np.ones(len(self.changes), bool)), best.posterior)
+        limit = FIT_RATIO * _like_most(bound)
+        kept, loose = np.where(free < limit, 1.0, 0.0), (bound >= limit) & (free < limit)
+        changed = not (np.array_equal(kept, self.kept) and np.array_equal(loose, self.loose))
+        self.kept, self.loose = kept, loose
         return changed
 
     def fit(self, way: str, length: float, start: Sizes | None = None) -> Hypothesis:
@@ -195,12 +211,12 @@ class _Problem:
         every = [h for h in every if h.log_weight > top - LEAST_LOG_WEIGHT]
         weights = np.exp([h.log_weight - top for h in every])
         one = max(every, key=lambda h: h.log_weight)
-        misfit = _misfit(self.evidence(one.columns, one.posterior, everything=True), one.posterior)
         return JointEstimate(
             hypotheses=tuple(every),
             weights=weights / weights.sum(),
             kept=self.kept,
-            misfit=misfit,
+            loose=self.loose,
+            misfit=misfit(self.evidence(one.columns, one.posterior, everything=True), one.posterior),
             noise_factor=self.scale,
             expansion=self.expansion,
             learnt=self.learnt,
@@ -212,24 +228,25 @@ class _Problem:
         """Put targets aside that do not fit the best hypothesis, and enlarge the noise where the rest do not fit as claimed."""
         for _ in range(OUTLIER_ROUNDS):
             best = max(every, key=lambda h: h.log_weight)
-            changed = self.put_aside(best)
-            noisier = self.enlarge(best)
-            if not (changed or noisier):
+            # the noise is judged once the outliers are gone
+            if not (self.put_aside(best) or self.enlarge(best)):
                 break
             every = _finite([self.fit(h.way, length, h.posterior.sizes) for h in every])
         return every
 
     def enlarge(self, best: Hypothesis) -> bool:
-        """Scale the noise up where residuals are larger than claimed; True when that changed anything."""
+        """Scale the noise to the residuals where they are larger than claimed; True when that changed anything."""
         evidence = self.evidence(best.columns, best.posterior)
         freedom = 6 * self.kept.sum() - determined(evidence, best.posterior)
         if freedom < LEAST_FREEDOM:
             return False
-        factor = float(_misfit(evidence, best.posterior).sum()) / freedom
-        if factor < 1 + NOTED_MISFIT * np.sqrt(2 / freedom):
-            return False
-        self.scale *= factor
-        return True
+        factor = float((misfit(evidence, best.posterior) * self.kept).sum()) / freedom
+        scale = self.scale * factor
+        if scale < 1 + NOTED_MISFIT * np.sqrt(2 / freedom):
+            scale = 1.0
+        changed = abs(scale / self.scale - 1) > SETTLED_SCALE
+        self.scale = scale if changed else self.scale
+        return changed
 
     def _lengths(self) -> list[float]:
         radius = self.surfaces.fields.radius_mm
@@ -255,18 +272,9 @@ def _finite(hypotheses: list[Hypothesis]) -> list[Hypothesis]:
     return good or hypotheses
 
 
-def _misfit(evidence: Evidence, found: Posterior) -> Array:
-    """Chi-square (N,) of what is left of each target's change, against the photographs' own covariance; 0 where nothing is used."""
-    at = evidence.columns.change @ found.mean + np.einsum("nij,nj->ni", evidence.columns.local, found.local_mean)
-    left = evidence.score - np.einsum("nij,nj->ni", evidence.information, at)
-    regular = evidence.information + LEAST_INFORMATION * np.eye(6)
-    return np.asarray(np.einsum("ni,ni->n", left, np.linalg.solve(regular, left[..., None])[..., 0]))
-
-
-def _not_outlying(misfit: Array, ratio: float) -> Array:
-    """1 for targets whose misfit is like that of most, 0 for the others."""
-    like_most = max(float(np.quantile(misfit, LIKE_MOST)), USUAL_MISFIT)
-    return np.where(misfit < ratio * like_most, 1.0, 0.0)
+def _like_most(values: Array) -> float:
+    """Misfit that most targets do not exceed."""
+    return max(float(np.quantile(values, LIKE_MOST)), USUAL_MISFIT)
 
 
 def _start_sizes(priors: Priors, expansion: float) -> tuple[Sizes, tuple[str, ...]]:
@@ -299,6 +307,9 @@ def _expansion(changes: TargetChanges, camera_from_dish: Pose, pattern: Pattern,
     """Mean and sigma of the expansion, per unit: as given, or what the change of scale of the whole picture leaves open."""
     if priors.expansion_ppm is not None:
         return priors.expansion_ppm[0] * 1e-6, priors.expansion_ppm[1] * 1e-6
+    if priors.still:
+        # a rigid body does not grow
+        return 0.0, 0.0
     before = camera_from_dish.apply(pattern.center_mm[changes.index])
     after = changes.moved.apply(before)
     scale = float(np.mean(np.linalg.norm(after, axis=1) / np.linalg.norm(before, axis=1))) - 1

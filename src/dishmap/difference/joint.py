@@ -19,8 +19,12 @@ from dishmap.difference.model import BLOCKS, LOCAL, Columns
 
 Array = NDArray[Any]
 
+# How far a target that moved on its own may rise, lean, and stretch with that.
+LOOSE_MM, LOOSE_RAD, LOOSE_STRAIN = 10.0, 0.1, 2e-3
 # How well targets on rigid parts keep their place on them.
 STILL_MM = 1e-3
+# Added to information that may be singular, as that on the turn of a lone ring: far below that of any photograph (per mm^2, per rad^2).
+LEAST_INFORMATION = 1e-9
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,8 @@ class Evidence:
     """Likelihoods of N targets, already weighted, and their columns.
 
     information (N, 6, 6) and score (N, 6) as in `TargetChanges`; constant: what the linearisation adds to the log-likelihood;
-    rough_length_mm: size of local bumps; still (S,): places of targets on rigid parts.
+    rough_length_mm: size of local bumps; still (S,): places of targets on rigid parts; loose (N,): targets that may rise and lean on
+    their own.
     """
 
     information: Array
@@ -53,6 +58,7 @@ class Evidence:
     columns: Columns
     rough_length_mm: float
     still: Array
+    loose: Array
 
 
 @dataclass(frozen=True)
@@ -91,6 +97,9 @@ def _local_sigmas(evidence: Evidence, sizes: Sizes) -> Array:
     out[:, 0] = unexplained[:, 0] + sizes.rough_mm**2
     out[:, 1:3] = (unexplained[:, 1] + (sizes.rough_mm / evidence.rough_length_mm) ** 2)[:, None]
     out[:, 3:] = sizes.print_strain**2
+    out[:, 0] += np.where(evidence.loose, LOOSE_MM**2, 0.0)
+    out[:, 1:3] += np.where(evidence.loose, LOOSE_RAD**2, 0.0)[:, None]
+    out[:, 3:] += np.where(evidence.loose, LOOSE_STRAIN**2, 0.0)[:, None]
     out[evidence.still] = 0.0
     return np.sqrt(out)
 
@@ -246,14 +255,26 @@ def _steps(evidence: Evidence, at: Posterior, names: Sequence[str]) -> dict[str,
     return out
 
 
+def misfit(evidence: Evidence, at: Posterior) -> Array:
+    """Chi-square (N,) of each target's change against what the coefficients say, whatever rise and stretch of its own its prior allows.
+
+    Targets that had no weight in the posterior are judged like the others.
+    """
+    left = evidence.score - np.einsum("nij,nj->ni", evidence.information, evidence.columns.change @ at.mean)
+    half = _local_sigmas(evidence, at.sizes)
+    scaled = evidence.columns.local * half[:, None]
+    inner = np.eye(LOCAL) + np.swapaxes(scaled, 1, 2) @ evidence.information @ scaled
+    pull = np.einsum("nij,ni->nj", scaled, left)
+    regular = evidence.information + LEAST_INFORMATION * np.eye(LOCAL)
+    whole = np.einsum("ni,ni->n", left, np.linalg.solve(regular, left[..., None])[..., 0])
+    return np.asarray(whole - np.einsum("ni,ni->n", pull, np.linalg.solve(inner, pull[..., None])[..., 0]))
+
+
 def determined(evidence: Evidence, at: Posterior) -> float:
-    """Number of unknowns that the photographs determine: coefficients and the targets' own."""
+    """Number of coefficients that the photographs determine."""
     scale = _scales(evidence.columns, at.sizes)
     free = scale > 0
-    count = float((1 - (at.factor[free] ** 2).sum(axis=1) / scale[free] ** 2).sum())
-    prior = _local_sigmas(evidence, at.sizes) ** 2
-    spread = ((at.local_by @ at.factor) ** 2).sum(axis=2) + np.diagonal(at.local_covariance, axis1=1, axis2=2)
-    return count + float((1 - spread[prior > 0] / prior[prior > 0]).sum())
+    return float((1 - (at.factor[free] ** 2).sum(axis=1) / scale[free] ** 2).sum())
 
 
 def _second_moments(evidence: Evidence, at: Posterior, names: Sequence[str]) -> dict[str, tuple[float, float]]:
@@ -267,16 +288,18 @@ def _second_moments(evidence: Evidence, at: Posterior, names: Sequence[str]) -> 
         if name in names:
             second = (away[rows] ** 2 + variance[rows]).sum() / size**2
             out[name] = float(second - rows.sum()), float(rows.sum() - variance[rows].sum() / size**2)
-    if "rough_mm" not in names and "print_strain" not in names:
-        return out
     spread = ((at.local_by @ at.factor) ** 2).sum(axis=2) + np.diagonal(at.local_covariance, axis1=1, axis2=2)
     prior = _local_sigmas(evidence, sizes) ** 2
     ratio = (at.local_mean**2 + spread) / np.maximum(prior, 1e-300) - 1
     known = 1 - spread / np.maximum(prior, 1e-300)
-    own = np.zeros_like(prior)
+    own, smooth = np.zeros_like(prior), np.zeros_like(prior)
     own[:, 0] = sizes.rough_mm**2
     own[:, 1:3] = (sizes.rough_mm / evidence.rough_length_mm) ** 2
-    share = own / np.maximum(prior, 1e-300)
-    out["rough_mm"] = (float((ratio * share)[:, :3].sum()), float((known * share**2)[:, :3].sum()))
+    smooth[:, :1], smooth[:, 1:3] = (sizes.normal_mm**2 * columns.unexplained[:, k : k + 1] for k in (0, 1))
+    own[evidence.still] = smooth[evidence.still] = 0.0
+    for name, part in (("rough_mm", own), ("normal_mm", smooth)):
+        share = part / np.maximum(prior, 1e-300)
+        before = out.get(name, (0.0, 0.0))
+        out[name] = before[0] + float((ratio * share).sum()), before[1] + float((known * share**2).sum())
     out["print_strain"] = (float(ratio[:, 3:].sum()), float(known[:, 3:].sum()))
     return out

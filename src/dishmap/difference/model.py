@@ -25,7 +25,7 @@ Array = NDArray[Any]
 # Wide enough to say nothing of the rigid motion left over after the alignment (micrometres), narrow enough for double precision.
 FREE_MOVE_MM, FREE_TURN_RAD = 10.0, 0.03
 # How points may follow a displacement along the normal: with the least strain (a membrane), staying on their normals, along the boresight
-# (as axial deformations are often given), or in any smooth way. The number is the degree of the slide beyond that.
+# (as axial deformations are often given), or in any smooth way. The number is the degree of the slide beyond that, if targets can show it.
 WAYS = {"least_strain": 4, "normal": 4, "axial": 4, "any": 8}
 # Degree of the displacement along the normal: what the targets can resolve, and a limit for the cost.
 SMALLEST_DEGREE, LARGEST_DEGREE = 4, 14
@@ -151,7 +151,7 @@ def columns_of(
         _rigid(pattern.center_mm[changes.index], axes),
         _expansion(pattern.center_mm[changes.index], axes),
         moved.combined(coefficients),
-        motion.combined(_free_slides(surfaces, WAYS[way])),
+        motion.combined(_free_slides(surfaces, min(WAYS[way], _slide_degree(len(axes))))),
     ]
     every = Motion(np.concatenate([p.move for p in parts], axis=-1), np.concatenate([p.gradient for p in parts], axis=-1))
     to_camera = (changes.moved @ camera_from_dish).rotation
@@ -202,6 +202,11 @@ def _rigid(points: Array, axes: Array) -> Motion:
 
 def _expansion(points: Array, axes: Array) -> Motion:
     return Motion(points[..., None], axes[..., :2][..., None])
+
+
+def _slide_degree(targets: int) -> int:
+    """Degree of slides that leaves half of what the targets show across the line of sight to check them: terms <= targets / 2."""
+    return max(1, int(np.floor((np.sqrt(1 + 4 * targets) - 3) / 2)))
 
 
 def _free_slides(surfaces: Surfaces, degree: int) -> Array:

@@ -35,8 +35,12 @@ LEAST_CONTRAST_SIGMAS = 3.0
 # Square of residuals over that of the noise: 1 +- 0.2 for 60 pixels; and what the model may miss, as a part of the step (a square
 # pixel seen as a Gaussian leaves 0.4 %).
 LARGEST_MISFIT = 2.2
+# From here on a piece's own misfit counts as its noise; below, it is chance and the noise common to all is the better word.
+CLEAR_MISFIT = 1.5
 MODEL_PART = 0.01
 ROUNDING_GREY2 = 1 / 12
+# What the model of an edge leaves in a picture without noise, and more: nothing is to be learnt from less.
+MODEL_SIGMA_PX = 1e-3
 # Fewer pieces do not tell the light's slope from their own disturbances.
 FEWEST_FOR_LIGHT = 50
 LIGHT_SCALE_PX = 1000.0
@@ -94,7 +98,8 @@ def fit_edges(gray: NDArray[Any], pieces: Pieces, half_px: float, light_inside: 
     good &= mean_square <= LARGEST_MISFIT * noise2 + (MODEL_PART * contrast) ** 2
     bend = 0.5 * blur**2 * pieces.curvature_per_px
     # rounding to whole grey levels is noise too, even where it shows none
-    variance = fitted.unit_variance * np.maximum(np.maximum(noise2, mean_square), ROUNDING_GREY2)
+    noisy = np.where(mean_square > CLEAR_MISFIT * noise2, mean_square, noise2)
+    variance = fitted.unit_variance * np.maximum(noisy, ROUNDING_GREY2) + MODEL_SIGMA_PX**2
     return Edges(fitted.shift_px + bend, np.sqrt(variance), contrast, good, blur, float(np.sqrt(noise2)))
 
 

@@ -70,9 +70,9 @@ def format_points(table: PointTable) -> str:
     lines = [",".join(COLUMNS)]
     for row in range(len(table)):
         values = [
-            *(_fixed(v, 6) for v in table.position_mm[row]),
-            *(_fixed(v, 9) for v in table.normal[row]),
-            *(_fixed(v, 6) for v in table.center_px[row]),
+            *(fixed(v, 6) for v in table.position_mm[row]),
+            *(fixed(v, 9) for v in table.normal[row]),
+            *(fixed(v, 6) for v in table.center_px[row]),
             *("" if math.isnan(v) else f"{v:.6g}" for v in sigmas[row]),
         ]
         lines.append(",".join([str(table.ids[row]), *values, names(int(table.quality[row]))]))
@@ -90,7 +90,7 @@ def format_ply(table: PointTable) -> str:
         *("property int id", *(f"property float {name}" for name in floats), "property int quality", "end_header"),
     ]
     for row in range(len(table)):
-        numbers = [*(_fixed(v, 6) for v in table.position_mm[row]), *(_fixed(v, 9) for v in table.normal[row])]
+        numbers = [*(fixed(v, 6) for v in table.position_mm[row]), *(fixed(v, 9) for v in table.normal[row])]
         rest = [str(table.ids[row]), *(f"{v:.6g}" for v in sigmas[row]), str(table.quality[row])]
         head.append(" ".join([*numbers, *rest]))
     return "\n".join(head) + "\n"
@@ -122,9 +122,9 @@ def parse_points(text: str, source: str = "the table of points") -> PointTable:
         try:
             if len(row) != len(COLUMNS):
                 raise InputError(f"{len(COLUMNS)} columns are needed, not {len(row)}")
-            ids.append(_id(row[0]))
-            values.append([_value(name, cell) for name, cell in zip(COLUMNS[1:-1], row[1:-1], strict=True)])
-            quality.append(_bits(row[-1]))
+            ids.append(id_of(row[0]))
+            values.append([value_of(name, cell, name in SIGMAS) for name, cell in zip(COLUMNS[1:-1], row[1:-1], strict=True)])
+            quality.append(bits_of(row[-1]))
         except InputError as error:
             raise InputError(f"{source}, line {number}: {error}") from error
     if len(set(ids)) < len(ids):
@@ -150,19 +150,22 @@ def _sigmas(covariance: Array) -> Array:
     return np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
 
 
-def _fixed(value: float, digits: int) -> str:
+def fixed(value: float, digits: int) -> str:
+    """A number with so many decimals."""
     # + 0.0 writes 0 for -0
     return f"{round(float(value), digits) + 0.0:.{digits}f}"
 
 
-def _id(cell: str) -> int:
-    if not (cell.isascii() and cell.isdecimal() and int(cell) < 2**31):
+def id_of(cell: str) -> int:
+    """The id in a cell of a table. Raises InputError."""
+    if not (cell.isascii() and cell.isdecimal() and len(cell) < 11 and int(cell) < 2**31):
         raise InputError(f"an id must be a whole number, not {cell[:30]!r}")
     return int(cell)
 
 
-def _value(name: str, cell: str) -> float:
-    if not cell and name in SIGMAS:
+def value_of(name: str, cell: str, sigma: bool) -> float:
+    """The finite number in a cell of the column `name`; a sigma is not negative, and NaN where the cell is empty. Raises InputError."""
+    if not cell and sigma:
         return math.nan
     try:
         value = float(cell)
@@ -170,12 +173,13 @@ def _value(name: str, cell: str) -> float:
         raise InputError(f"{name} must be a number, not {cell[:30]!r}") from error
     if not math.isfinite(value):
         raise InputError(f"{name} must be a finite number, not {cell!r}")
-    if name in SIGMAS and value < 0:
+    if sigma and value < 0:
         raise InputError(f"{name} must not be negative, as {cell} is")
     return value
 
 
-def _bits(cell: str) -> int:
+def bits_of(cell: str) -> int:
+    """The quality bits in a cell of a table. Raises InputError."""
     bits = 0
     for name in cell.split("|") if cell else []:
         if name != name.lower() or name.upper() not in Quality.__members__ or name == "clean":

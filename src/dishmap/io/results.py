@@ -1,4 +1,8 @@
-"""The files of a map: points.csv, points.ply, surface.json, summary.json, and points_spacecraft.csv when that frame is given."""
+"""The files of a map.
+
+points.csv, points.ply, surface.json, summary.json, for the method `pose` measurement.npz, and points_spacecraft.csv when that frame is
+given.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +24,7 @@ from dishmap import __version__
 from dishmap.camera.model import Camera
 from dishmap.errors import InputError
 from dishmap.io.atomic import write_files
+from dishmap.io.measurement_file import MEASUREMENT_FILE, measurement_bytes
 from dishmap.io.points_file import SIGMA_MM, format_ply, format_points, table_of
 from dishmap.io.pose_file import pose_content
 from dishmap.pipeline import Map
@@ -60,12 +65,20 @@ def photograph_cloud(result: Map, camera: Camera) -> PointCloud:
     return replace(result.cloud, center_px=camera.project(result.camera.unproject(result.cloud.center_px)))
 
 
-def result_files(result: Map, provenance: Provenance) -> dict[str, str]:
-    """All files of a map but its report: name -> text. Raises InputError when an input file cannot be read again."""
+def result_files(result: Map, provenance: Provenance) -> dict[str, str | bytes]:
+    """All files of a map but its report: name -> text or bytes. Raises InputError when an input file cannot be read again."""
     known = isinstance(result.poses, TargetPoses)
     cloud = photograph_cloud(result, provenance.camera)
     table = table_of(cloud, known)
-    files = {"points.csv": format_points(table), "points.ply": format_ply(table), "surface.json": surface_text(result)}
+    files: dict[str, str | bytes] = {
+        "points.csv": format_points(table),
+        "points.ply": format_ply(table),
+        "surface.json": surface_text(result),
+    }
+    if isinstance(result.poses, TargetPoses):
+        photograph = provenance.inputs.get("photograph")
+        digest = "" if photograph is None else sha256_of(photograph)
+        files[MEASUREMENT_FILE] = measurement_bytes(result.poses, provenance.camera, result.pattern, digest)
     if provenance.spacecraft_from_camera is not None:
         moved = transform_cloud(cloud, provenance.spacecraft_from_camera, "spacecraft")
         files[SPACECRAFT_FILE] = format_points(table_of(moved, known))
@@ -75,13 +88,14 @@ def result_files(result: Map, provenance: Provenance) -> dict[str, str]:
 def write_results(folder: str | Path, files: Mapping[str, str | bytes]) -> None:
     """Write the files of a map into an existing folder, all or none; what is there besides is left alone.
 
-    Points in the spacecraft frame that an earlier map left there are removed, since they do not belong to the new ones.
-    Raises InputError when a file cannot be written.
+    What an earlier map left there and this one does not make (points in the spacecraft frame, a measurement) is removed, since it does
+    not belong to the new files. Raises InputError when a file cannot be written.
     """
     write_files(folder, files)
-    if SPACECRAFT_FILE not in files:
-        with suppress(FileNotFoundError):
-            (Path(folder) / SPACECRAFT_FILE).unlink()
+    for name in (SPACECRAFT_FILE, MEASUREMENT_FILE):
+        if name not in files:
+            with suppress(FileNotFoundError):
+                (Path(folder) / name).unlink()
 
 
 def surface_text(result: Map) -> str:
@@ -89,9 +103,9 @@ def surface_text(result: Map) -> str:
     fit = result.surface
     content: dict[str, Any] = {"format": SURFACE_FORMAT, "fitted": fit is not None, "problem": result.surface_problem}
     if fit is not None:
-        content |= _surface(fit)
+        content |= surface_content(fit)
     content["camera_from_dish"] = pose_content(result.camera_from_dish)
-    return _json(content)
+    return json_text(content)
 
 
 def summary_text(result: Map, provenance: Provenance) -> str:
@@ -101,13 +115,13 @@ def summary_text(result: Map, provenance: Provenance) -> str:
     spacecraft = provenance.spacecraft_from_camera
     content = {
         "format": SUMMARY_FORMAT,
-        "versions": {"dishmap": __version__, "python": platform.python_version(), **_versions()},
-        "inputs": {what: {"path": str(path), "sha256": _sha256(path)} for what, path in provenance.inputs.items()},
+        "versions": versions(),
+        "inputs": {what: {"path": str(path), "sha256": sha256_of(path)} for what, path in provenance.inputs.items()},
         "image": {"width_px": camera.width_px, "height_px": camera.height_px},
         "method": result.method,
-        "hint": _hint(provenance.hint),
+        "hint": hint_content(provenance.hint),
         "assumptions": asdict(provenance.assumptions) if isinstance(result.poses, TargetPoses) else None,
-        "camera": _camera(camera),
+        "camera": camera_content(camera),
         "camera_from_dish": pose_content(result.camera_from_dish),
         "spacecraft_from_camera": None if spacecraft is None else pose_content(spacecraft),
         "counts": {
@@ -129,7 +143,7 @@ def summary_text(result: Map, provenance: Provenance) -> str:
         ],
         "seconds": {name: round(value, 3) for name, value in provenance.seconds.items()},
     }
-    return _json(content)
+    return json_text(content)
 
 
 def shared_calibration(cloud: PointCloud, camera: Camera) -> dict[str, Any]:
@@ -154,7 +168,8 @@ def shared_calibration(cloud: PointCloud, camera: Camera) -> dict[str, Any]:
     }
 
 
-def _surface(fit: SurfaceFit) -> dict[str, Any]:
+def surface_content(fit: SurfaceFit) -> dict[str, Any]:
+    """A fitted surface as it stands in `surface.json`."""
     sigmas = np.sqrt(np.diag(fit.covariance))
     shared = fit.calibration_covariance
     columns = zip(fit.names, fit.units, fit.coefficients, sigmas, strict=True)
@@ -221,7 +236,8 @@ def _place(pixel: Array) -> dict[str, float | None]:
     return {"u_px": u, "v_px": v}
 
 
-def _hint(hint: Hint) -> dict[str, Any]:
+def hint_content(hint: Hint) -> dict[str, Any]:
+    """A hint as it stands in summaries."""
     if hint is None:
         return {"kind": "none"}
     if isinstance(hint, PoseGuess):
@@ -229,7 +245,8 @@ def _hint(hint: Hint) -> dict[str, Any]:
     return {"kind": "upright"}
 
 
-def _camera(camera: Camera) -> dict[str, Any]:
+def camera_content(camera: Camera) -> dict[str, Any]:
+    """A camera as it stands in summaries."""
     return {
         "model": camera.model,
         "parameters": dict(zip(camera.parameter_names, map(float, camera.parameters), strict=True)),
@@ -238,15 +255,17 @@ def _camera(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _versions() -> dict[str, str]:
-    out = {}
+def versions() -> dict[str, str]:
+    """Of this program, Python and the libraries that numbers come from."""
+    out = {"dishmap": __version__, "python": platform.python_version()}
     for name in LIBRARIES:
         with suppress(metadata.PackageNotFoundError):
             out[name] = metadata.version(name)
     return out
 
 
-def _sha256(path: str | Path) -> str:
+def sha256_of(path: str | Path) -> str:
+    """Digest of an input file. Raises InputError when it cannot be read again."""
     try:
         with Path(path).open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -258,7 +277,8 @@ def _list(values: Array) -> Any:
     return np.asarray(values, dtype=float).tolist()
 
 
-def _json(content: dict[str, Any]) -> str:
+def json_text(content: dict[str, Any]) -> str:
+    """The text of a JSON file, with null where a number is not finite."""
     return json.dumps(_finite(content), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 

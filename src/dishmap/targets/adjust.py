@@ -28,6 +28,7 @@ from dishmap.targets.pixels import (
     ring_sums,
     without_light,
 )
+from dishmap.targets.solve import solve_scaled
 from dishmap.transforms import rotation_from_vector
 
 Array = NDArray[Any]
@@ -166,7 +167,7 @@ def _one_step(batch: Batch, pixels: RingPixels, poses: Poses, state: State, weig
     turn = np.linalg.norm(delta[:, 3:6], axis=1)
     limit = np.minimum(1.0, np.minimum(LARGEST_STEP_PX / np.maximum(move_px, 1e-9), LARGEST_TURN_RAD / np.maximum(turn, 1e-9)))
     poses, state = _moved(poses, state, delta * np.nan_to_num(limit)[:, None])
-    good = converged & np.isfinite(poses.position_mm).all(axis=1)
+    good = converged & np.isfinite(poses.position_mm).all(axis=1) & np.isfinite(information).all(axis=(1, 2))
     turning = float(np.nan_to_num(turn).max(initial=0.0)) > NEW_FIELDS_RAD
     return Adjusted(poses, state, information, data, good, sums, residual, variance), turning
 
@@ -196,28 +197,6 @@ def with_rest(batch: Batch, pixels: RingPixels, fit: Adjusted, weighting: Weight
         merged(fit.residual, more.residual, rings),
         merged(fit.noise_variance, more.noise_variance, rest),
     )
-
-
-def solve_scaled(matrix: Array, right: Array) -> Array:
-    """Solve (T, G, G) x = (T, G) after scaling to unit diagonal; a singular or NaN system gives zeros."""
-    scale = 1 / np.sqrt(np.maximum(np.diagonal(matrix, axis1=1, axis2=2), 1e-300))
-    scaled = matrix * scale[:, :, None] * scale[:, None, :]
-    bad = ~(np.isfinite(scaled).all(axis=(1, 2)) & np.isfinite(right).all(axis=1))
-    scaled[bad] = np.eye(matrix.shape[-1])
-    scaled += 1e-12 * np.eye(matrix.shape[-1])
-    out = np.linalg.solve(scaled, (np.where(bad[:, None], 0.0, right) * scale)[..., None])[..., 0] * scale
-    return np.where(bad[:, None], 0.0, out)
-
-
-def inverse_scaled(matrix: Array) -> Array:
-    """Inverse (T, G, G) of positive definite matrices after scaling to unit diagonal; NaN where not finite."""
-    scale = 1 / np.sqrt(np.maximum(np.diagonal(matrix, axis1=1, axis2=2), 1e-300))
-    scaled = matrix * scale[:, :, None] * scale[:, None, :]
-    bad = ~np.isfinite(scaled).all(axis=(1, 2))
-    scaled[bad] = np.eye(matrix.shape[-1])
-    out = np.linalg.inv(scaled + 1e-13 * np.eye(matrix.shape[-1])) * scale[:, :, None] * scale[:, None, :]
-    out[bad] = np.nan
-    return out
 
 
 def with_other_priors(fit: Adjusted, before: Priors, after: Priors) -> tuple[Poses, State]:

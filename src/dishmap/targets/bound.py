@@ -15,12 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from dishmap.camera.model import Camera
 from dishmap.errors import InputError
-from dishmap.targets.adjust import Batch, Priors, by_target, inverse_scaled, prior_terms
+from dishmap.targets.adjust import Batch, Priors, by_target, prior_terms
 from dishmap.targets.edges import Poses
+from dishmap.targets.light import light_columns
 from dishmap.targets.pattern import Pattern, TargetKind
-from dishmap.targets.pixels import RingSums, State, coverage_columns, light_columns, rings_of, without_light
+from dishmap.targets.pixels import BLUR, OFFSET_MM, OFFSET_PX, TONE, RingSums, State, coverage_columns, rings_of, without_light
+from dishmap.targets.solve import inverse_scaled, solve_each
 from dishmap.targets.stages import FIRST_LOG_BLUR_SIGMA, Assumptions, Group, layout
 from dishmap.targets.start import centers_of
+from dishmap.transforms import Pose
 
 Array = NDArray[Any]
 
@@ -66,25 +69,10 @@ def target_bound(
     """
     if not (contrast_to_noise > 0 and psf_sigma_px > 0 and normal_sigma_rad > 0):
         raise InputError("a bound needs a positive contrast-to-noise ratio, blur and normal sigma")
-    assumptions = assumptions or Assumptions()
-    count = len(poses)
-    blur = float(np.hypot(psf_sigma_px, PIXEL_VARIANCE_PX2**0.5))
-    curvature = np.zeros((count, 2, 2)) if curvature_per_mm is None else np.asarray(curvature_per_mm, dtype=float)
-    priors = Priors(
-        poses.rotation[..., 2],
-        np.full(count, normal_sigma_rad),
-        assumptions.ink_spread_fraction * float(kind.radius_mm.max()),
-        assumptions.tone_shift_px,
-        blur,
-        FIRST_LOG_BLUR_SIGMA,
-        0.0,
-        1.0,
-        kind.turns_freely,
-    )
-    state = State(np.zeros(count), np.zeros(count), np.full(count, blur), np.zeros(count))
-    group = Group(kind, np.arange(count), poses, Batch(camera, curvature, rings_of(kind), priors), state)
-    information = _information(group, blur) * contrast_to_noise**2
-    precision, _ = prior_terms(poses, state, priors)
+    curvature = np.zeros((len(poses), 2, 2)) if curvature_per_mm is None else np.asarray(curvature_per_mm, dtype=float)
+    group = _group(camera, kind, poses, curvature, psf_sigma_px, normal_sigma_rad, assumptions or Assumptions())
+    information = _information(group, float(group.state.blur_px[0])) * contrast_to_noise**2
+    precision, _ = prior_terms(poses, group.state, group.batch.priors)
     covariance = inverse_scaled(information + precision[:, :, None] * np.eye(precision.shape[1]))[:, :6, :6]
     _, by_pose = centers_of(camera, poses, curvature)
     position = poses.steps @ covariance[:, :3, :3] @ np.swapaxes(poses.steps, 1, 2)
@@ -94,6 +82,32 @@ def target_bound(
         np.sqrt(position[:, 2, 2]),
         np.sqrt(covariance[:, 3, 3] + covariance[:, 4, 4]),
     )
+
+
+def pattern_information(
+    camera: Camera, pattern: Pattern, index: NDArray[np.int64], camera_from_dish: Pose, contrast_to_noise: float, psf_sigma_px: float
+) -> Array:
+    """Fisher information (N, 7, 7) on (move along camera axes in mm, turn about target axes in rad, edge offset in mm) of targets.
+
+    The targets number `index` (N,) lie where the undeformed pattern puts them; light, blur, tone and blooming are unknown.
+    """
+    out = np.zeros((len(index), 7, 7))
+    names = np.array(pattern.kind_names)[index]
+    known, rest = [*range(6), OFFSET_MM], [OFFSET_PX, BLUR, TONE]
+    for name in np.unique(names):
+        rows = np.flatnonzero(names == name)
+        poses = Poses(camera_from_dish.rotation @ pattern.axes[index[rows]], camera_from_dish.apply(pattern.center_mm[index[rows]]))
+        curvature = pattern.curvature_per_mm[index[rows]]
+        group = _group(camera, pattern.kinds[str(name)], poses, curvature, psf_sigma_px, FREE_NORMAL_SIGMA_RAD, Assumptions())
+        full = _information(group, float(group.state.blur_px[0])) * contrast_to_noise**2
+        precision, _ = prior_terms(poses, group.state, group.batch.priors)
+        full[:, rest, rest] += precision[:, rest]
+        cross = full[:, known][:, :, rest]
+        kept = full[:, known][:, :, known] - cross @ solve_each(full[:, rest][:, :, rest], np.swapaxes(cross, 1, 2))
+        axes = np.zeros((len(rows), 7, 7))
+        axes[:, :3, :3], axes[:, 3:, 3:] = poses.steps, np.eye(4)
+        out[rows] = axes @ kept @ np.swapaxes(axes, 1, 2)
+    return out
 
 
 def pattern_bound(camera: Camera, pattern: Pattern, poses: Poses, contrast_to_noise: float, psf_sigma_px: float) -> Bound:
@@ -107,6 +121,27 @@ def pattern_bound(camera: Camera, pattern: Pattern, poses: Poses, contrast_to_no
     order = np.argsort(np.concatenate([index for index, _ in parts]))
     columns = (np.concatenate([getattr(b, f) for _, b in parts])[order] for f in Bound.__dataclass_fields__)
     return Bound(*columns)
+
+
+def _group(
+    camera: Camera, kind: TargetKind, poses: Poses, curvature: Array, psf_sigma_px: float, normal_sigma_rad: float, assumptions: Assumptions
+) -> Group:
+    """Targets of one kind at `poses`, with the priors of a fit and the blur of the optics."""
+    count = len(poses)
+    blur = float(np.hypot(psf_sigma_px, PIXEL_VARIANCE_PX2**0.5))
+    priors = Priors(
+        poses.rotation[..., 2],
+        np.full(count, normal_sigma_rad),
+        assumptions.ink_spread_fraction * float(kind.radius_mm.max()),
+        assumptions.tone_shift_px,
+        blur,
+        FIRST_LOG_BLUR_SIGMA,
+        0.0,
+        1.0,
+        kind.turns_freely,
+    )
+    state = State(np.zeros(count), np.zeros(count), np.full(count, blur), np.zeros(count))
+    return Group(kind, np.arange(count), poses, Batch(camera, curvature, rings_of(kind), priors), state)
 
 
 def _information(group: Group, blur_px: float) -> Array:

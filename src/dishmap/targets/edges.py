@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from dishmap.camera.model import Camera
 from dishmap.targets.pattern import bent_print_mm
+from dishmap.targets.solve import solve_each
 
 Array = NDArray[Any]
 Pair = tuple[NDArray[Any], NDArray[Any]]
@@ -205,7 +206,7 @@ def _least_squares(basis: Array, values: Array) -> Array:
     # relative to each normal's size: a patch far off the image has large monomials, and must not make a singular matrix
     size = np.trace(normal, axis1=1, axis2=2)
     normal += 1e-14 * (1 + size[:, None, None]) * np.eye(basis.shape[1])
-    return np.swapaxes(np.linalg.solve(normal, basis @ np.swapaxes(values, 1, 2)), 1, 2)
+    return np.swapaxes(solve_each(normal, basis @ np.swapaxes(values, 1, 2)), 1, 2)
 
 
 def plane_at_offsets(maps: LocalMaps, patches: Patches, rows: slice, du_px: Array, dv_px: Array) -> NDArray[np.float32]:

@@ -13,25 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri
 
-from dishmap.targets.adjust import LARGEST_TURN_RAD, Adjusted, Batch, by_target, prior_terms, solve_scaled
+from dishmap.targets.adjust import LARGEST_TURN_RAD, Adjusted, Batch, by_target, prior_terms
 from dishmap.targets.edges import Poses, monomials
-from dishmap.targets.pixels import (
-    BLUR,
-    GEOMETRY,
-    GROUND,
-    INK,
-    LIGHT,
-    OFFSET_MM,
-    OFFSET_PX,
-    TONE,
-    TONE_RATIOS,
-    RingPixels,
-    State,
-    coverage_columns,
-    light_columns,
-    toned,
-)
+from dishmap.targets.light import GROUND, INK, LIGHT, TONE_RATIOS, light_columns, ridge, toned
+from dishmap.targets.pixels import BLUR, GEOMETRY, OFFSET_MM, OFFSET_PX, TONE, RingPixels, State, coverage_columns
 from dishmap.targets.scene_noise import NoiseModel
+from dishmap.targets.solve import solve_each, solve_scaled
 from dishmap.transforms import rotation_from_vector
 
 Array = NDArray[Any]
@@ -153,7 +140,7 @@ def _without_curved_light(
     spread = noise.variance((light[:, None] @ columns[:, :LIGHT])[:, 0])
     weight = seen / spread
     own = (columns * weight[:, None]) @ np.swapaxes(columns, 1, 2)
-    own += 1e-7 * np.trace(own, axis1=1, axis2=2)[:, None, None] * np.eye(own.shape[1])
+    own += ridge(own)[..., None] * np.eye(own.shape[1])
     grey = pixels.grey.astype(float)
     bound = CLIP_SIGMAS * np.sqrt(spread * variance[pixels.target, None])
     levels = _levels(columns, own, weight, grey)
@@ -165,10 +152,10 @@ def _without_curved_light(
     contrast = step[:, :1] + step[:, 1:2] * pixels.s + step[:, 2:] * pixels.t
     shape = geometry * (contrast * weight)[:, None]
     cross = shape @ np.swapaxes(columns, 1, 2)
-    normal = shape @ np.swapaxes(geometry * contrast[:, None], 1, 2) - cross @ np.linalg.solve(own, np.swapaxes(cross, 1, 2))
+    normal = shape @ np.swapaxes(geometry * contrast[:, None], 1, 2) - cross @ solve_each(own, np.swapaxes(cross, 1, 2))
     return normal, (shape @ residual[..., None])[..., 0], levels[:, :LIGHT]
 
 
 def _levels(columns: Array, own: Array, weight: Array, grey: Array) -> Array:
     """Light levels (M, L) of weighted least squares with normal matrix `own`."""
-    return np.asarray(np.linalg.solve(own, columns @ (weight * grey)[..., None])[..., 0])
+    return np.asarray(solve_each(own, columns @ (weight * grey)[..., None])[..., 0])

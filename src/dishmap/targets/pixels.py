@@ -22,7 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.targets.edges import MOTION_TERMS, LocalMaps, Patches, edge_distance, monomials
+from dishmap.targets.light import GROUND, INK, LIGHT, TINY, dark_over_light, light_and_weights, light_columns, ridge, toned
 from dishmap.targets.pattern import TargetKind
+from dishmap.targets.solve import solve_each
 
 Array = NDArray[Any]
 Single = NDArray[Any]
@@ -33,9 +35,6 @@ Part = tuple[slice, int, Bool]
 # Geometry parameters of a target: 3 moves (mm), 3 turns (rad), edge offset (mm), edge offset (px), blur s (px), log gamma.
 GEOMETRY = 10
 OFFSET_MM, OFFSET_PX, BLUR, TONE = 6, 7, 8, 9
-# Light parameters of a ring: ground level and slopes, ink level and slopes, bend (grey levels, in local units).
-LIGHT = 9
-GROUND, INK, BEND = slice(0, 3), slice(3, 6), slice(6, 9)
 # Half width of the band of pixels used, in blurs: beyond it the edge changes the pixel by under 0.2 % of the contrast.
 BAND_BLURS, BAND_EXTRA_PX = 2.5, 0.5
 # Above this product of curvature and blur the series for curved edges leaves more than 0.001 px; see tests.
@@ -48,13 +47,8 @@ FAR_BLURS = 4.0
 LARGEST_SHIFT_PX = 2e-4
 # Pixels handled at once: fewer cost the overhead of numpy's calls, more leave the processor's cache.
 PIXELS_AT_ONCE = 40000
-TINY = np.float32(1e-6)
 # Halves of the coefficients of t^5 to t in formula 7.1.26 of Abramowitz and Stegun, Handbook of Mathematical Functions.
 ERF_TERMS = (0.5307027145, -0.7265760135, 0.7107068705, -0.142248368, 0.127414796)
-# Share of the cut up to which a residual keeps its full weight.
-TAPER = np.float32(0.65)
-# Ink over ground, as far as a tone curve is followed.
-TONE_RATIOS = (0.02, 0.95)
 
 
 @dataclass(frozen=True)
@@ -373,55 +367,6 @@ def _blur_matrix(size: int, fine: int, first: int, extra: Array) -> tuple[Single
     return kernel.astype(np.float32), (kernel * (z2 - 1) / extra[:, None, None]).astype(np.float32)
 
 
-def toned(cover: Single, dark_over_light: Single, log_gamma: Single) -> tuple[Single, Single, Single]:
-    """Coverage (M, n) as a tone curve shows it, its derivative by the true coverage, and by log gamma.
-
-    With levels G of the ground and K of the ink, light adds as G^gamma (1 - c) + K^gamma c; the level recorded is the 1/gamma
-    power of that, and lies the returned part of the way from G to K. dark_over_light (M, 1) is K / G.
-    """
-    gamma = np.exp(log_gamma)
-    power = dark_over_light**gamma
-    scale = 1 / (1 - dark_over_light)
-    light = cover * (power - 1)
-    light += 1
-    log_level = np.log(light)
-    log_level *= 1 / gamma
-    level = np.exp(log_level)
-    by_light = np.divide(level, light, out=light)
-    log_level *= level * scale
-    log_level -= cover * by_light * (scale * power * np.log(dark_over_light))
-    return (1 - level) * scale, by_light * ((1 - power) * scale / gamma), log_level
-
-
-def light_columns(s: Single, t: Single, cover: Single, out: Single | None = None) -> Single:
-    """Derivative of the pixels by the ring's light levels (M, L, n): ground and ink, each level and two slopes, and the bend."""
-    if out is None:
-        out = np.empty((len(cover), LIGHT, cover.shape[1]), np.float32)
-    np.subtract(1, cover, out=out[:, 0])
-    out[:, 3] = cover
-    for column, place in ((1, s), (2, t)):
-        np.multiply(out[:, 0], place, out=out[:, column])
-        np.multiply(out[:, 3], place, out=out[:, column + 3])
-    for column, first, second in ((6, s, s), (7, s, t), (8, t, t)):
-        np.multiply(first, second, out=out[:, column])
-    return out
-
-
-def solve_light(weighted: Single) -> Array:
-    """Best light levels (M, L) of each ring for a given coverage; slopes lean weakly towards zero so that tiny rings hold.
-
-    weighted (M, L + 1, n): the columns of `light_columns` and the grey levels, times the roots of the weights.
-    """
-    sums = (weighted @ np.swapaxes(weighted, 1, 2)).astype(float)
-    normal = sums[:, :LIGHT, :LIGHT]
-    normal[:, range(LIGHT), range(LIGHT)] += _ridge(normal)
-    return np.linalg.solve(normal, sums[:, :LIGHT, LIGHT:])[..., 0]
-
-
-def _ridge(normal: Array) -> Array:
-    return 1e-7 * np.maximum(np.trace(normal, axis1=1, axis2=2), 1e-9)[:, None]
-
-
 def batches(rings: int, pixels: int) -> list[slice]:
     """Equal shares of `rings` with `pixels` each, small enough for the processor's cache."""
     count = max(1, min(rings, -(-rings * pixels // PIXELS_AT_ONCE)))
@@ -447,12 +392,12 @@ def _sums(rows: slice, pixels: RingPixels, rings: Rings, maps: LocalMaps, state:
     every = np.empty((len(s), GEOMETRY + LIGHT + 1, s.shape[1]), np.float32)
     cover, geometry, edges = coverage_columns(rows, pixels, rings, maps, state, every[:, :GEOMETRY])
     log_gamma = np.asarray(state.log_gamma[pixels.target[rows], None], np.float32)
-    bent, slope, geometry[:, TONE] = toned(np.clip(cover, 0, 1), _dark_over_light(cover, grey, used), log_gamma)
+    bent, slope, geometry[:, TONE] = toned(np.clip(cover, 0, 1), dark_over_light(cover, grey, used), log_gamma)
     light_columns(s, t, bent, every[:, GEOMETRY:-1])
     every[:, -1] = grey
     every[:, GEOMETRY:] *= used[:, None]
     cut = None if weighting.cut is None else weighting.cut[rows, None].astype(np.float32)
-    light, robust = _light_and_weights(every[:, GEOMETRY:], used if pixels.blocked is None else used * ~pixels.blocked[rows], used, cut)
+    light, robust = light_and_weights(every[:, GEOMETRY:], used if pixels.blocked is None else used * ~pixels.blocked[rows], used, cut)
     single = light.astype(np.float32)
     model = (single[:, None] @ every[:, GEOMETRY:-1])[:, 0]
     residual = every[:, -1] - model
@@ -474,52 +419,12 @@ def _sums(rows: slice, pixels: RingPixels, rings: Rings, maps: LocalMaps, state:
     return RingSums(sums[:, :-1, :-1], sums[:, :-1, -1], light, sums[:, -1, -1], robust.sum(axis=1, dtype=float), kept), residual
 
 
-def _light_and_weights(rows: Single, seen: Single, used: Single, cut: Single | None) -> tuple[Array, Single]:
-    """Light levels (M, L) and weights (M, n) of pixels, from the rows of `solve_light` with weights `used` (0 or 1).
-
-    `seen` are weights of what is to be looked at, a part of `used`; `cut` (M, 1) is that of `Weighting`.
-    """
-
-    def levels(weight: Single) -> tuple[Array, Single]:
-        light = solve_light(rows if weight is used else rows * np.sqrt(weight)[:, None])
-        return light, rows[:, LIGHT] - (light[:, None].astype(np.float32) @ rows[:, :LIGHT])[:, 0]
-
-    light, residual = levels(seen)
-    if cut is None:
-        return light, seen
-    robust = _tapered(residual, cut, seen)
-    if robust is not seen:
-        # the levels were found with the outliers in; once more without them
-        light, residual = levels(robust)
-        robust = _tapered(residual, cut, seen)
-    return light, robust
-
-
-def _dark_over_light(cover: Single, grey: Single, used: Single) -> Single:
-    """Ink level over ground level (M, 1) of each ring, from a fit of the two levels alone; it only bends the tone curve."""
-    ink = cover * used
-    a, b, c = used.sum(axis=1), ink.sum(axis=1), np.einsum("mn,mn->m", ink, cover)
-    p, q = np.einsum("mn,mn->m", grey, used), np.einsum("mn,mn->m", grey, ink)
-    determinant = np.maximum(a * c - b * b, TINY)
-    ground, step = (c * p - b * q) / determinant, (a * q - b * p) / determinant
-    ratio = (ground + step) / np.maximum(ground, TINY)
-    return np.clip(ratio, *TONE_RATIOS)[:, None].astype(np.float32)
-
-
-def _tapered(residual: Single, cut: Single, used: Single) -> Single:
-    """Weights that are 1 up to TAPER of the cut and fall to 0 at the cut, so that Gaussian noise loses nothing."""
-    x = residual / cut
-    if not (np.abs(x) * used > TAPER).any():
-        return used
-    return np.square(np.clip((1 - x * x) * np.float32(1 / (1 - TAPER**2)), 0, 1)) * used
-
-
 def without_light(sums: RingSums) -> tuple[Array, Array]:
     """Normal equations of the geometry alone (M, G, G), (M, G), with each ring's own light levels eliminated (Schur)."""
     g = slice(0, GEOMETRY)
     cross, own = sums.normal[:, g, GEOMETRY:], sums.normal[:, GEOMETRY:, GEOMETRY:].copy()
-    own[:, range(LIGHT), range(LIGHT)] += _ridge(own)
-    solved = np.linalg.solve(own, np.concatenate([np.swapaxes(cross, 1, 2), sums.right[:, GEOMETRY:, None]], axis=2))
+    own[:, range(LIGHT), range(LIGHT)] += ridge(own)
+    solved = solve_each(own, np.concatenate([np.swapaxes(cross, 1, 2), sums.right[:, GEOMETRY:, None]], axis=2))
     normal = sums.normal[:, g, g] - cross @ solved[..., :GEOMETRY]
     right = sums.right[:, g] - (cross @ solved[..., GEOMETRY:])[..., 0]
     return normal, right

@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from dishmap.camera.model import Camera
 from dishmap.errors import CameraError, ImageError, MeasurementError
 from dishmap.quality import Quality, is_rejected, names
-from dishmap.targets.adjust import Adjusted, Priors, by_target, inverse_scaled, prior_terms
+from dishmap.targets.adjust import Adjusted, Priors, by_target, prior_terms
 from dishmap.targets.detect import Detections
 from dishmap.targets.identify import Identity
 from dishmap.targets.pattern import Pattern
@@ -25,6 +25,7 @@ from dishmap.targets.pixels import BLUR, GEOMETRY, OFFSET_MM, OFFSET_PX, TONE, R
 from dishmap.targets.scene_noise import NoiseModel, noise_model
 from dishmap.targets.sensitivity import calibration_jacobian
 from dishmap.targets.settle import with_clear_light, with_learnt_normals, with_likelier_normals
+from dishmap.targets.solve import inverse_scaled, solve_each
 from dishmap.targets.stages import (
     OCCLUDED_BELOW,
     Assumptions,
@@ -258,7 +259,7 @@ def _likelihood(priors: Priors, adjusted: Adjusted, turned: Array, enlarged: Arr
     full = adjusted.data_information.copy()
     full[:, rest, rest] += precision[:, rest]
     cross = full[:, known][:, :, rest]
-    solved = np.linalg.solve(full[:, rest][:, :, rest], np.swapaxes(cross, 1, 2))
+    solved = solve_each(full[:, rest][:, :, rest], np.swapaxes(cross, 1, 2))
     information = full[:, known][:, :, known] - cross @ solved
     axes = np.zeros((len(full), 7, 7))
     axes[:, :6, :6], axes[:, 6, 6] = turned, 1.0

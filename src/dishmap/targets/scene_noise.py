@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dishmap.targets.adjust import Adjusted, Priors, inverse_scaled
+from dishmap.targets.adjust import Adjusted, Priors
+from dishmap.targets.solve import inverse_each, inverse_scaled
 
 Array = NDArray[Any]
 
@@ -109,9 +110,9 @@ def free_tilt(fit: Adjusted, priors: Priors, expected: Array) -> tuple[Array, Ar
     posterior = inverse_scaled(fit.information)[:, 3:5, 3:5]
     tilt = _tilt(fit, expected)
     precision = priors.normal_sigma_rad[:, None, None] ** -2.0
-    data = np.linalg.inv(posterior) - precision * np.eye(2)
+    data = inverse_each(posterior) - precision * np.eye(2)
     data += 1e-9 * np.eye(2) * np.maximum(np.trace(data, axis1=1, axis2=2), 1e-3)[:, None, None]
-    covariance = np.linalg.inv(data)
+    covariance = inverse_each(data)
     shift = (covariance @ _tilt(fit, priors.normal)[..., None])[..., 0] * precision[:, 0]
     return tilt + shift, covariance
 

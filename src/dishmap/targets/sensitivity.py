@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dishmap.targets.adjust import Batch
 from dishmap.targets.edges import Poses, project_printed
 from dishmap.targets.pattern import TargetKind, bent_print_mm
+from dishmap.targets.solve import solve_each
 from dishmap.targets.window import OUTLINE_POINTS
 from dishmap.transforms import rotation_from_vector
 
@@ -49,7 +50,7 @@ def calibration_jacobian(batch: Batch, kind: TargetKind, poses: Poses, edge_info
     information = np.swapaxes(weighted, 1, 2) @ pose_columns
     information[:, [3, 4], [3, 4]] += batch.priors.normal_sigma_rad[:, None] ** -2.0
     information[:, 5, 5] += 1e-6 + (1e8 if batch.priors.turns_freely else 0.0)
-    change = -np.linalg.solve(information, np.swapaxes(weighted, 1, 2) @ camera_columns)
+    change = -solve_each(information, np.swapaxes(weighted, 1, 2) @ camera_columns)
     return poses.steps @ change[:, :3]
 
 

@@ -16,7 +16,6 @@ from dishmap.targets.adjust import (
     Priors,
     adjust,
     by_target,
-    inverse_scaled,
     with_other_priors,
     with_rest,
 )
@@ -35,6 +34,7 @@ from dishmap.targets.scene_noise import (
     noise_model,
     normal_spread,
 )
+from dishmap.targets.solve import inverse_each, inverse_scaled
 from dishmap.targets.start import EllipsePoints, centers_of, ellipse_points, fit_ellipses, nominal_poses, pair_circles, rigid_pose
 from dishmap.targets.window import outline, patches_around, ring_areas, ring_layout, ring_pixels
 from dishmap.transforms import Pose, angle_between_rad
@@ -341,7 +341,7 @@ def _prior_sigma(coarse: Coarse, expected: Array, shared: Shared) -> Array:
     """
     tilt, covariance = free_tilt(coarse.adjusted, coarse.group.batch.priors, expected)
     width = covariance + shared.normal_sigma_rad**2 * np.eye(2)
-    far = np.einsum("ti,tij,tj->t", tilt, np.linalg.inv(width), tilt) > (2 * STRAY_SIGMAS) ** 2
+    far = np.einsum("ti,tij,tj->t", tilt, inverse_each(width), tilt) > (2 * STRAY_SIGMAS) ** 2
     return np.where(far & coarse.adjusted.converged, FIRST_NORMAL_SIGMA_RAD, shared.normal_sigma_rad)
 
 

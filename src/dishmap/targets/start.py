@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.camera.model import Camera
-from dishmap.targets.adjust import Batch, by_target, prior_terms, solve_scaled
+from dishmap.targets.adjust import Batch, by_target, prior_terms
 from dishmap.targets.edges import MOTION_TERMS, Patches, Poses, edge_distance, monomials, project_printed
 from dishmap.targets.pattern import Pattern, TargetKind
 from dishmap.targets.pixels import GEOMETRY, OFFSET_PX, State
+from dishmap.targets.solve import solve_scaled
 from dishmap.transforms import Pose, cross_matrix, rotation_from_vector
 
 Array = NDArray[Any]

@@ -1,0 +1,400 @@
+"""What a difference says, in numbers and in plain sentences: for the top of its report and for the terminal."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from dishmap.compare import PAPER, Difference, DifferenceTable
+from dishmap.difference.difference_map import Considered, DifferenceMap
+from dishmap.quality import MEANING, Quality, names
+from dishmap.verdict import Fact, Verdict, id_list, number, targets
+
+Array = NDArray[Any]
+Bools = NDArray[np.bool_]
+
+# A rigid motion is spoken of when chance would show it this rarely.
+RIGID_SIGNIFICANCE = 0.01
+# Decimals written of a value: two digits of its sigma, within what a table can hold.
+SIGMA_DIGITS, MOST_DECIMALS = 2, 6
+# p values below this are written as a bound: the tail of a chi-square is not known to such depths.
+SMALLEST_P = 1e-12
+PPM = 1e6
+# How large an expansion and a drift of the focal length are made up to say what they would do.
+EXAMPLE_PPM = 10.0
+WAYS = {
+    "least_strain": "as a membrane does: points slide so that it strains the least",
+    "normal": "along its normals: points do not slide",
+    "axial": "along the boresight",
+    "any": "with any smooth slide along the surface",
+}
+# What the learnt sizes are, with the factor to the unit in which they are shown.
+SIZES = {
+    "normal_mm": ("displacement along the normal", 1.0, "mm"),
+    "slide_strain": ("strain by further slide", PPM, "ppm"),
+    "rough_mm": ("rise of each target on its own", 1.0, "mm"),
+    "print_strain": ("strain of each print on its own", PPM, "ppm"),
+    "expansion": ("uniform expansion", PPM, "ppm"),
+    "focal": ("focal drift", PPM, "ppm"),
+}
+STRAINS = {
+    "rigid": "The surface was taken not to stretch, and prints to keep their size, as was given.",
+    "free": "The size of prints was taken to say nothing of depth, as was given: prints may have stretched by any amount.",
+}
+
+
+@dataclass(frozen=True)
+class Rigid:
+    """The best-fit rigid motion: move_mm, turn_deg (3,) and their sigmas; lengths with sigma along them; whether it is significant."""
+
+    move_mm: Array
+    sigma_move_mm: Array
+    turn_deg: Array
+    sigma_turn_deg: Array
+    moved_mm: tuple[float, float]
+    turned_deg: tuple[float, float]
+    significant: bool
+
+
+def difference_verdict(result: Difference) -> Verdict:
+    """The headline, the facts and the warnings of a difference."""
+    return Verdict(_headline(result), tuple(_facts(result)), tuple(_warnings(result)))
+
+
+def with_sigma(value: float, sigma: float, unit: str, sign: bool = False) -> str:
+    """`0.340 ± 0.005 mm`: the value to two digits of its sigma; without a known sigma three digits of the value alone.
+
+    The unit brings its own space.
+    """
+    if not (np.isfinite(sigma) and sigma > 0):
+        return f"{'+' if sign and value > 0 else ''}{number(value)}{unit}"
+    decimals = int(np.clip(SIGMA_DIGITS - 1 - np.floor(np.log10(sigma)), 0, MOST_DECIMALS))
+    shown = f"{value:{'+' if sign else ''}.{decimals}f}"
+    # a sigma or value below the last decimal would read as zero
+    small = sigma < 10.0**-MOST_DECIMALS
+    return f"{number(value)} ± {number(sigma)}{unit}" if small else f"{shown} ± {sigma:.{decimals}f}{unit}"
+
+
+def rms_with_sigma(value_mm: Array, factor: Array, own_mm2: Array) -> tuple[float, float]:
+    """Root mean square of estimates (N,) and the root mean square error of it as an estimate of the truth's.
+
+    Covariance is factor factor^T + diag(own), factor (N, R). The truth's mean square is a quadratic form of a Gaussian with the known
+    mean and variance (Mathai and Provost 1992, section 3.2); noise alone makes the truth's rms differ from that of a map near zero.
+    """
+    n = len(value_mm)
+    covariance = factor @ factor.T + np.diag(own_mm2)
+    square = float(value_mm @ value_mm) / n
+    expected = square + float(np.trace(covariance)) / n
+    if expected == 0:
+        return 0.0, 0.0
+    variance = float(4 * value_mm @ covariance @ value_mm + 2 * (covariance**2).sum()) / n**2
+    spread = variance / (4 * expected)
+    mean = np.sqrt(max(expected - spread, 0.0))
+    return float(np.sqrt(square)), float(np.sqrt(max(expected + square - 2 * mean * np.sqrt(square), 0.0)))
+
+
+def set_aside(table: DifferenceTable) -> Bools:
+    """Rows (N,) whose own change was not used."""
+    return np.asarray((table.quality & int(Quality.OUTLIER)) != 0)
+
+
+def largest_row(table: DifferenceTable) -> int:
+    """The row with the largest change of shape, among those that were used."""
+    used = ~set_aside(table)
+    return int(np.argmax(np.where(used | ~used.any(), np.abs(table.shape_mm), -1.0)))
+
+
+def rigid_of(joint: DifferenceMap) -> Rigid:
+    """The rigid motion with its sigmas, about the origin of the dish frame."""
+    move, turn = joint.rigid_motion.translation_mm, joint.rigid_motion.rotation_vector_rad
+    sigma = np.sqrt(np.diag(joint.rigid_covariance))
+    scale = np.where(sigma > 0, sigma, 1.0)
+    unit = np.concatenate([move, turn]) / scale
+    chi_square = float(unit @ np.linalg.pinv(joint.rigid_covariance / np.outer(scale, scale), hermitian=True) @ unit)
+    return Rigid(
+        move,
+        sigma[:3],
+        np.degrees(turn),
+        np.degrees(sigma[3:]),
+        _length(move, joint.rigid_covariance[:3, :3]),
+        _length(np.degrees(turn), np.degrees(np.degrees(joint.rigid_covariance[3:, 3:]))),
+        bool(chi2.sf(chi_square, 6) < RIGID_SIGNIFICANCE),
+    )
+
+
+def _length(vector: Array, covariance: Array) -> tuple[float, float]:
+    """Length of a vector (3,) and its sigma along it; of a vector of no length the largest sigma."""
+    length = float(np.linalg.norm(vector))
+    if length == 0:
+        return 0.0, float(np.sqrt(max(np.linalg.eigvalsh(covariance)[-1], 0.0)))
+    return length, float(np.sqrt(max(vector @ covariance @ vector, 0.0))) / length
+
+
+def p_words(p_value: float) -> str:
+    """`p = 0.61`, or a bound where it is tiny."""
+    return f"p = {number(p_value)}" if p_value >= SMALLEST_P else f"p < {SMALLEST_P:g}"
+
+
+def scale_open(joint: DifferenceMap) -> bool:
+    """Whether the scale of the whole picture changed, nothing is known of expansion, and so motion and expansion are not told apart."""
+    return joint.priors.expansion_ppm is None and joint.expansion_assumed[1] > 0
+
+
+def way_words(joint: DifferenceMap, one: Considered, flat: bool) -> str:
+    """One way of moving in plain words; flat: the nominal surface is a plane."""
+    if joint.priors.still:
+        return "as a rigid body"
+    if flat and one.way != "any":
+        return "in and out; on a plane that makes no point slide"
+    return WAYS[one.way]
+
+
+def unused_targets(result: Difference) -> list[tuple[int, str]]:
+    """(id, reason) of targets of either state that have no row, or whose own change was not used."""
+    if result.joint is not None:
+        return list(result.joint.rejected)
+    said = dict((*result.reference.rejected, *result.current.rejected))
+    absent = np.setdiff1d(np.union1d(result.reference.ids, result.current.ids), result.table.ids)
+    said |= {int(i): "not measured in both photographs" for i in absent if int(i) not in said}
+    return sorted(said.items())
+
+
+def _headline(result: Difference) -> str:
+    joint, table = result.joint, result.table
+    if result.same:
+        return "Both states are the same photograph, pixel by pixel, so nothing can have changed between them."
+    if joint is None:
+        rms, shape = _rms(table.displacement_mm), _rms(table.shape_mm)
+        return (
+            f"By the paper's method the surface was displaced by {number(rms)} mm rms, {number(shape)} mm rms of it change of shape; "
+            "whether that is significant the method does not say."
+        )
+    test = joint.significance
+    if joint.priors.still:
+        against = f"; but the photographs contradict a rigid body ({p_words(test.p_value)})" if test.changed else ""
+        return f"Taken as a rigid body, as was given, the surface {_motion(joint)}{against}."
+    size = with_sigma(*rms_with_sigma(joint.shape_mm, joint.shape_factor, joint.shape_own_mm2), " mm")
+    whole = f"as a whole the surface {_motion(joint)}"
+    if not test.changed:
+        return f"No significant change of shape: {size} rms, {p_words(test.p_value)}; {whole}."
+    row = largest_row(table)
+    most = with_sigma(table.shape_mm[row], table.sigma_shape_mm[row], " mm", sign=True)
+    return f"The shape changed by {size} rms, most at target {table.ids[row]} ({most}); {whole}."
+
+
+def _motion(joint: DifferenceMap) -> str:
+    rigid = rigid_of(joint)
+    if scale_open(joint):
+        percent = f"{100 * joint.expansion_assumed[1]:.2g} %"
+        return f"moved along the line of sight or changed its size, which one camera cannot tell apart (scale changed by {percent})"
+    if not rigid.significant:
+        return "did not move significantly"
+    return f"moved by {with_sigma(*rigid.moved_mm, ' mm')} and turned by {with_sigma(*rigid.turned_deg, '°')}"
+
+
+def _facts(result: Difference) -> list[Fact]:
+    table, joint = result.table, result.joint
+    aside = int(set_aside(table).sum())
+    lost = len(result.pattern) - len(table)
+    facts = [Fact("Targets compared", f"{len(table)} of {len(result.pattern)}", f"{aside} put aside, {lost} not in both states")]
+    row = largest_row(table)
+    x, y, _ = table.nominal_mm[row]
+    at = Fact(
+        "Largest change of shape",
+        with_sigma(table.shape_mm[row], np.nan, " mm", sign=True),
+        f"{_give_or_take(table.sigma_shape_mm[row], ' mm')}target {table.ids[row]} at x {x:.0f}, y {y:.0f} mm",
+    )
+    if joint is None:
+        return [*facts, Fact("Change of shape, rms", f"{number(_rms(table.shape_mm))} mm", "best-fit rigid motion removed"), at]
+    size, sigma = rms_with_sigma(joint.shape_mm, joint.shape_factor, joint.shape_own_mm2)
+    by = "motion of the rigid parts" if joint.priors.rigid_ids else "best-fit rigid motion"
+    median = number(float(np.median(table.sigma_shape_mm)))
+    return [
+        *facts,
+        Fact(
+            "Change of shape, rms",
+            f"{number(size)} mm",
+            f"{_give_or_take(sigma, ' mm')}{by} removed; sigma of one target {median} mm (median)",
+        ),
+        at,
+        *_joint_facts(joint),
+    ]
+
+
+def _joint_facts(joint: DifferenceMap) -> list[Fact]:
+    test, rigid = joint.significance, rigid_of(joint)
+    best = max(joint.considered, key=lambda c: c.weight)
+    given = "assumed" if joint.expansion_assumed[1] == 0 else f"beforehand {_ppm(joint.expansion_assumed)}"
+    drift = "assumed" if joint.priors.focal_drift == 0 else f"beforehand 0 ± {number(PPM * joint.priors.focal_drift)} ppm"
+    p_value = number(test.p_value) if test.p_value >= SMALLEST_P else f"< {SMALLEST_P:g}"
+    return [
+        Fact("p value", p_value, f"of no change of shape: chi-square {number(test.chi_square)}, {test.degrees} degrees of freedom"),
+        Fact("Rigid motion", f"{number(rigid.moved_mm[0])} mm", _components(rigid.move_mm, rigid.sigma_move_mm, " mm")),
+        Fact("Rigid turn", f"{number(rigid.turned_deg[0])}°", _components(rigid.turn_deg, rigid.sigma_turn_deg, "°")),
+        _share("Uniform expansion", joint.expansion, given),
+        _share("Focal drift", joint.focal_drift, drift),
+        Fact("Ways of moving that count", str(len(joint.considered)), f"the best has {best.weight:.0%} of the weight"),
+        Fact("Noise / claimed noise", number(float(np.sqrt(joint.noise_factor))), "sigmas were enlarged by this"),
+    ]
+
+
+def _share(name: str, value: tuple[float, float], before: str) -> Fact:
+    return Fact(name, f"{number(PPM * value[0])} ppm", f"{_give_or_take(PPM * value[1], ' ppm')}{before}")
+
+
+def _give_or_take(sigma: float, unit: str) -> str:
+    return f"± {number(float(sigma))}{unit}; " if np.isfinite(sigma) and sigma > 0 else ""
+
+
+def _components(values: Array, sigmas: Array, unit: str) -> str:
+    return ", ".join(f"{axis} {with_sigma(float(v), float(s), unit)}" for axis, v, s in zip("xyz", values, sigmas, strict=True))
+
+
+def _ppm(value: tuple[float, float]) -> str:
+    return with_sigma(PPM * value[0], PPM * value[1], " ppm")
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _warnings(result: Difference) -> list[str]:
+    joint, table, out = result.joint, result.table, []
+    if joint is None:
+        out.append(
+            "The paper's method was asked for alone. Its sigmas, where it has any, hold the noise of centres but not what the method "
+            "leaves out; the method `joint` gives sigmas of everything."
+        )
+    else:
+        out += _joint_warnings(joint)
+    if result.camera.covariance is None:
+        out.append(
+            "The calibration's covariance is unknown (the camera file holds none), so that sigmas leave out what an error of the "
+            "calibration does to a difference. `dishmap calibrate` writes a camera with it."
+        )
+    if lost := unused_targets(result):
+        reasons = Counter(reason for _, reason in lost)
+        for why, count in reasons.items():
+            each = ", for each" if count > 1 else ""
+            out.append(f"{targets(count)} not used ({id_list([i for i, r in lost if r == why])}){each}: {why}.")
+    for flag in Quality:
+        ids = table.ids[(table.quality & int(flag)) != 0] if flag else []
+        # what was put aside is told above, with the reason
+        if len(ids) and not (flag is Quality.OUTLIER and joint is not None):
+            out.append(f"{targets(len(ids))} flagged {names(int(flag))} ({id_list(ids)}): {MEANING[flag]}.")
+    return out + [f"No surface through the {name}: {why.rstrip('.')}." for name, why in result.surface_problems.items()]
+
+
+def _joint_warnings(joint: DifferenceMap) -> list[str]:
+    out = []
+    if scale_open(joint):
+        depth = float(joint.camera_from_dish.translation_mm[2])
+        part = joint.expansion_assumed[1]
+        out.append(
+            f"The scale of the whole picture changed by {number(100 * part)} %. A motion of {number(depth * part)} mm along the line of "
+            f"sight and an expansion of {number(PPM * part)} ppm look the same to one camera, and nothing was said of expansion, so that "
+            "either may be true and the sigmas of displacement, shape and rigid motion hold both. Say how much the surface may have "
+            "expanded to tell them apart."
+        )
+    if not joint.converged:
+        out.append("Not every way of moving that was weighed converged; its numbers are those of the last step.")
+    if joint.noise_factor > 1:
+        out.append(
+            f"The targets' changes differ from a smooth motion by {number(float(np.sqrt(joint.noise_factor)))} times what their claimed "
+            "sigmas allow; all sigmas here were enlarged by this."
+        )
+    if not joint.zernike_terms:
+        out.append(f"{targets(len(joint))} are too few to report Zernike terms from.")
+    return out
+
+
+def assumptions(joint: DifferenceMap, flat: bool) -> list[str]:
+    """What the estimate rests on and what one camera cannot see, in sentences; flat: the nominal surface is a plane."""
+    best = max(joint.considered, key=lambda c: c.weight)
+    out = [_expansion_words(joint), _focal_words(joint), _strain_words(joint, best)]
+    out += _smoothness_words(joint, best)
+    if joint.priors.slide is not None and not joint.priors.still:
+        out.append(f"The surface was taken to move {way_words(joint, best, flat)}, as was given.")
+    if joint.priors.rigid_ids:
+        out.append(f"Targets {id_list(joint.priors.rigid_ids)} were taken to sit on rigid parts; their motion is the rigid motion.")
+    return [*out, *_unseen(joint)]
+
+
+def _expansion_words(joint: DifferenceMap) -> str:
+    found, assumed = _ppm(joint.expansion), _ppm(joint.expansion_assumed)
+    if joint.priors.expansion_ppm is not None:
+        return f"Expansion: {assumed} was given beforehand; with the photographs it is {found}."
+    if scale_open(joint):
+        return f"Expansion: nothing was said of it and the picture's scale changed, so {assumed} was assumed; it is {found}."
+    depth = EXAMPLE_PPM / PPM * float(joint.camera_from_dish.translation_mm[2])
+    return (
+        "Expansion: none was assumed, as nothing was said of it and the scale of the picture hardly changed. An expansion by "
+        f"{EXAMPLE_PPM:g} ppm would pass for a motion of {number(depth)} mm towards the camera."
+    )
+
+
+def _focal_words(joint: DifferenceMap) -> str:
+    sigma = joint.priors.focal_drift
+    if sigma > 0:
+        found = _ppm(joint.focal_drift)
+        return f"Focal length: a drift of 0 ± {number(PPM * sigma)} ppm was allowed for; with the photographs it is {found}."
+    depth = EXAMPLE_PPM / PPM * float(joint.camera_from_dish.translation_mm[2])
+    return (
+        f"Focal length: taken as unchanged. A drift of {EXAMPLE_PPM:g} ppm (the camera warms up) would pass for a motion of "
+        f"{number(depth)} mm along the line of sight."
+    )
+
+
+def _strain_words(joint: DifferenceMap, best: Considered) -> str:
+    strain = joint.priors.strain
+    if joint.priors.still:
+        return "Strain: the surface was taken to move as a rigid body, as was given, so that it neither bends nor stretches."
+    if isinstance(strain, str):
+        return f"Strain: {STRAINS[strain][:1].lower()}{STRAINS[strain][1:]}"
+    slide, prints = (f"{number(PPM * best.sizes[name])} ppm" for name in ("slide_strain", "print_strain"))
+    if strain is not None:
+        return f"Strain: a standard deviation of {slide} was given."
+    return f"Strain: learnt from the photographs. Prints stretched by {prints} each on its own, and the slide added {slide} (rms)."
+
+
+def _smoothness_words(joint: DifferenceMap, best: Considered) -> list[str]:
+    if joint.priors.still:
+        return []
+    far = "given" if joint.priors.amplitude_mm is not None else "learnt"
+    long = "given" if joint.priors.length_mm is not None else "weighed"
+    return [
+        f"Smoothness: displacement of {number(best.sizes['normal_mm'])} mm ({far}) that changes over {number(best.length_mm)} mm ({long}; "
+        "values of the best way of moving). A sharper bend between targets would go unseen, and no sigma holds it."
+    ]
+
+
+def _unseen(joint: DifferenceMap) -> list[str]:
+    return [
+        "One camera cannot tell a motion of the surface from one of the camera: the rigid motion is that of one relative to the other.",
+        "It sees depth by the size of prints. What enlarges all of them alike (expansion, a longer focal length) looks like an approach; "
+        "what stretches one print looks like an approach of that target, and its neighbours are all that speaks against it.",
+    ]
+
+
+def paper_facts(result: Difference) -> list[Fact]:
+    """Numbers of the paper's method, and how far it is from the joint estimate where there is one."""
+    paper, table = result.paper, result.tables[PAPER]
+    if paper is None:
+        return []
+    common = f"{number(paper.common_depth_change_mm)} mm"
+    facts = [
+        Fact("Displacement, rms", f"{number(_rms(table.displacement_mm))} mm", f"{targets(len(table))}, along the normal"),
+        Fact("Change of shape, rms", f"{number(_rms(table.shape_mm))} mm", "best-fit rigid motion removed"),
+        Fact("Scale of the registration", f"{paper.registration.scale:.6f}", f"by itself a depth change of {common}"),
+        Fact("Pairs used", f"{int((paper.confidence > 0).sum())} of {len(paper.ratios)}", f"up to {number(paper.reach_mm)} mm apart"),
+    ]
+    if result.joint is not None:
+        _, ours, theirs = np.intersect1d(result.joint.ids, table.ids, return_indices=True)
+        gap = _rms(result.joint.shape_mm[ours] - table.shape_mm[theirs])
+        facts.append(Fact("From the joint estimate, rms", f"{number(gap)} mm", "of the two changes of shape"))
+    return facts
