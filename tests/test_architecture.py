@@ -23,7 +23,8 @@ ORDER = [
     # know nothing of cameras or dishes
     *("errors", "quality", "transforms", "robust"),
     # the camera
-    *("camera.model", "camera.undistort", "camera.chessboard", "camera.bundle", "camera.calibrate", "camera.uncertainty"),
+    *("camera.model", "camera.undistort", "camera.board", "camera.chessboard", "camera.bundle", "camera.problem"),
+    *("camera.screening", "camera.calibrate", "camera.uncertainty"),
     # shapes in which deformations are spoken of
     *("surface.zernike",),
     # what is printed
@@ -36,18 +37,9 @@ ORDER = [
     *("targets.layout", "targets.rigid", "targets.markgrid", "targets.candidates", "targets.growth", "targets.constellations"),
     *("targets.beam", "targets.search", "targets.rivals", "targets.identify"),
     # measuring it in the raw pixels
-    *(
-        "targets.solve",
-        "targets.edges",
-        "targets.light",
-        "targets.pixels",
-        "targets.window",
-        "targets.neighbours",
-        "targets.adjust",
-        "targets.start",
-    ),
-    *("targets.sensitivity", "targets.scene_noise", "targets.glare", "targets.stages", "targets.settle"),
-    *("targets.pose",),
+    *("targets.solve", "targets.edges", "targets.light", "targets.pixels", "targets.window", "targets.neighbours"),
+    *("targets.adjust", "targets.start", "targets.sensitivity", "targets.scene_noise", "targets.glare", "targets.stages"),
+    *("targets.settle", "targets.pose"),
     # measuring it as the paper does, and the limit of both
     *("targets.groups", "targets.paper", "targets.bound"),
     # the surface through the points
@@ -63,7 +55,7 @@ ORDER = [
     *("simulate.deform", "simulate.scene", "simulate.forward", "simulate.truth", "simulate.contour", "simulate.render"),
     *("simulate.scenario",),
     # all of it in one short function
-    *("pipeline", "compare"),
+    *("pipeline", "compare", "figures"),
     # files
     *("io.atomic", "io.image_header", "io.images", "io.picture_file", "io.pose_file", "io.camera_file", "io.pattern_file"),
     *("io.scenario_file", "io.truth_file", "io.points_file", "io.measurement_file", "io.results"),
@@ -71,7 +63,8 @@ ORDER = [
     # people: what a map says in words, in pictures, on a page
     *("verdict", "plot.canvas", "plot.photograph", "plot.maps", "plot.outlines", "plot.scene", "plot.calibration", "page", "report"),
     # and what a difference says
-    *("difference_verdict", "plot.difference", "plot.difference_photograph", "plot.difference_scene", "difference_report"),
+    *("difference_verdict", "difference_assumptions", "plot.difference", "plot.difference_photograph", "plot.difference_scene"),
+    *("difference_report",),
     # the program
     *("cli.terminal", "cli.options", "cli.prior_options", "cli.outcome", "cli.difference_outcome"),
     *("cli.calibrate", "cli.pattern", "cli.simulate", "cli.undistort"),

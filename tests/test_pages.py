@@ -44,12 +44,17 @@ def test_readme_maps_a_file(tutorial: dict[str, Any], tmp_path: Path, monkeypatc
     monkeypatch.chdir(tmp_path)
     dishmap.write_camera("camera.yaml", tutorial["camera"])
     dishmap.write_pattern("pattern.json", tutorial["pattern"])
-    assert cv2.imwrite("photo.jpg", tutorial["shot"].image, [cv2.IMWRITE_JPEG_QUALITY, 100])
+    again = dishmap.simulate_photograph(tutorial["scene"], np.random.default_rng(2))
+    for name, image in (("photo.jpg", tutorial["shot"].image), ("later.jpg", again.image)):
+        assert cv2.imwrite(name, image, [cv2.IMWRITE_JPEG_QUALITY, 100])
     names: dict[str, Any] = {}
     exec(compile(python_code("README.md"), "README.md", "exec"), names)
     truth = tutorial["shot"].truth
     assert names["result"].cloud.ids.tolist() == truth.ids.tolist()
     assert np.abs(names["result"].cloud.position_mm - truth.center_mm)[:, 2].max() < JPEG_DEPTH_MM
+    # nothing moved between the two
+    assert not names["change"].joint.significance.changed
+    assert np.abs(names["change"].table.shape_mm).max() < JPEG_DEPTH_MM
 
 
 def commands(page: str) -> list[str]:

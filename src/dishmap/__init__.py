@@ -20,8 +20,12 @@ if TYPE_CHECKING:
     from dishmap.camera.chessboard import find_boards
     from dishmap.camera.model import Camera
     from dishmap.camera.undistort import undistort_image, undistort_points
+    from dishmap.compare import compare_photographs
+    from dishmap.difference.priors import Priors
     from dishmap.io.camera_file import read_camera, write_camera
+    from dishmap.io.difference_file import read_difference
     from dishmap.io.images import read_gray
+    from dishmap.io.measurement_file import read_measurement, write_measurement
     from dishmap.io.pattern_file import read_pattern, write_pattern
     from dishmap.pipeline import map_photograph
     from dishmap.simulate.deform import Deformation
@@ -50,12 +54,14 @@ _HOME = {
     "PointCloud": "dishmap.surface.cloud",
     "Pose": "dishmap.transforms",
     "PoseGuess": "dishmap.targets.identify",
+    "Priors": "dishmap.difference.priors",
     "Scene": "dishmap.simulate.scene",
     "Sensor": "dishmap.simulate.scene",
     "Surface": "dishmap.targets.pattern",
     "TargetKind": "dishmap.targets.pattern",
     "Upright": "dishmap.targets.identify",
     "calibrate": "dishmap.camera.calibrate",
+    "compare_photographs": "dishmap.compare",
     "dish": "dishmap.targets.builders",
     "facing_pose": "dishmap.simulate.scene",
     "find_boards": "dishmap.camera.chessboard",
@@ -66,12 +72,15 @@ _HOME = {
     "measure_targets": "dishmap.targets.pose",
     "plate": "dishmap.targets.builders",
     "read_camera": "dishmap.io.camera_file",
+    "read_difference": "dishmap.io.difference_file",
     "read_gray": "dishmap.io.images",
+    "read_measurement": "dishmap.io.measurement_file",
     "read_pattern": "dishmap.io.pattern_file",
     "simulate_photograph": "dishmap.simulate.render",
     "undistort_image": "dishmap.camera.undistort",
     "undistort_points": "dishmap.camera.undistort",
     "write_camera": "dishmap.io.camera_file",
+    "write_measurement": "dishmap.io.measurement_file",
     "write_pattern": "dishmap.io.pattern_file",
 }
 # `dishmap.simulate` is the package, so its function of that name goes by another one here.
@@ -87,6 +96,7 @@ __all__ = [
     "PointCloud",
     "Pose",
     "PoseGuess",
+    "Priors",
     "Scene",
     "Sensor",
     "Surface",
@@ -94,6 +104,7 @@ __all__ = [
     "Upright",
     "__version__",
     "calibrate",
+    "compare_photographs",
     "dish",
     "facing_pose",
     "find_boards",
@@ -104,12 +115,15 @@ __all__ = [
     "measure_targets",
     "plate",
     "read_camera",
+    "read_difference",
     "read_gray",
+    "read_measurement",
     "read_pattern",
     "simulate_photograph",
     "undistort_image",
     "undistort_points",
     "write_camera",
+    "write_measurement",
     "write_pattern",
 ]
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from dishmap.camera.model import Camera
 from dishmap.camera.undistort import pinhole_camera
@@ -81,8 +82,8 @@ class Difference:
 
     method: one of DIFFERENCE_METHODS; joint, paper: the records of the methods that were asked for; tables: method -> its rows, the
     main method's first; surfaces: robust surfaces over x, y of the dish frame through `displacement` and `shape` of the joint
-    estimate and through `paper`; surface_problems: why one of them is missing. reference, current: the measured targets;
-    image (H, W): the current photograph; same: both states are the same pixels.
+    estimate and through `paper`; surface_problems: why one of them is missing (of `paper`: the whole method). reference, current:
+    the measured targets; image (H, W): the current photograph; same: both states are the same photograph.
     """
 
     method: str
@@ -182,9 +183,25 @@ def compare_states(
 
     surface: basis of the surfaces, see `default_basis`. The method `paper` uses the paper's
     centres when both states have them, else those of the fitted targets. Raises MeasurementError when too few targets
-    are common, InputError for priors that name an unknown target; a joint surface that cannot be fitted is told in `surface_problems`.
+    are common, InputError for priors that name an unknown target, FitError when the paper's method alone is asked for and fails; a
+    surface that cannot be fitted, or that method beside the joint one, is told in `surface_problems`.
     """
     check_method(method, surface)
+    # matrices of some hundred rows: threads would cost more than they bring, far more on a busy machine
+    with threadpool_limits(limits=1, user_api="blas"):
+        return _compared(reference, current, camera, pattern, priors, method, surface, progress)
+
+
+def _compared(
+    reference: State,
+    current: State,
+    camera: Camera,
+    pattern: Pattern,
+    priors: Priors | None,
+    method: str,
+    surface: Basis | None,
+    progress: Tell | None,
+) -> Difference:
     common = np.intersect1d(reference.poses.ids, current.poses.ids)
     if not len(common):
         raise MeasurementError(
@@ -204,9 +221,14 @@ def compare_states(
     if method != JOINT:
         before, after = _centers(reference, current, camera)
         lab = cloud_of(reference.poses)
-        paper = paper_difference(before, after, lab, pinhole_camera(camera), reference.poses.camera_from_dish, basis=basis)
-        tables[PAPER] = paper_table(paper, before, after, camera, pattern, reference.poses)
-        surfaces[PAPER] = paper.surface
+        try:
+            paper = paper_difference(before, after, lab, pinhole_camera(camera), reference.poses.camera_from_dish, basis=basis)
+            tables[PAPER] = paper_table(paper, before, after, camera, pattern, reference.poses)
+            surfaces[PAPER] = paper.surface
+        except FitError as error:
+            if method == PAPER:
+                raise
+            problems[PAPER] = str(error)
     same = reference.image is not None and current.image is not None and np.array_equal(reference.image, current.image)
     return Difference(
         method, camera, pattern, reference.poses, current.poses, joint, paper, tables, surfaces, problems, current.image, same
@@ -329,66 +351,3 @@ def _design(fit: SurfaceFit, xy_mm: Array) -> Array:
     """Columns (K, P) of a surface that is linear in its coefficients: its heights with each coefficient 1 and the others 0."""
     units = np.eye(len(fit.coefficients))
     return np.stack([surface_heights(replace(fit, coefficients=one), *xy_mm.T).height_mm for one in units], axis=1)
-
-
-@dataclass(frozen=True)
-class Figures:
-    """One table in a few numbers: root mean squares over its targets, in mm, and the largest change of shape; sigmas NaN if unknown."""
-
-    targets: int
-    displacement_rms_mm: float
-    sigma_displacement_rms_mm: float
-    depth_change_rms_mm: float
-    sigma_depth_change_rms_mm: float
-    shape_rms_mm: float
-    sigma_shape_rms_mm: float
-    largest_shape_mm: float
-    largest_shape_id: int
-
-
-@dataclass(frozen=True)
-class Apart:
-    """How far two methods disagree over the targets that both give: root mean squares in mm."""
-
-    targets: int
-    displacement_rms_mm: float
-    depth_change_rms_mm: float
-    shape_rms_mm: float
-
-
-def figures_of(table: DifferenceTable) -> Figures:
-    """The few numbers of a table, which must have a row."""
-    largest = int(np.argmax(np.abs(table.shape_mm)))
-    return Figures(
-        targets=len(table),
-        displacement_rms_mm=_rms(table.displacement_mm),
-        sigma_displacement_rms_mm=_rms(table.sigma_displacement_mm),
-        depth_change_rms_mm=_rms(table.depth_change_mm),
-        sigma_depth_change_rms_mm=_rms(table.sigma_depth_change_mm),
-        shape_rms_mm=_rms(table.shape_mm),
-        sigma_shape_rms_mm=_rms(table.sigma_shape_mm),
-        largest_shape_mm=float(table.shape_mm[largest]),
-        largest_shape_id=int(table.ids[largest]),
-    )
-
-
-def apart(one: DifferenceTable, other: DifferenceTable) -> Apart:
-    """How far two tables disagree. Raises MeasurementError when they have no target in common."""
-    ids, a, b = np.intersect1d(one.ids, other.ids, return_indices=True)
-    if not len(ids):
-        raise MeasurementError("the two methods have no target in common")
-    return Apart(
-        targets=len(ids),
-        displacement_rms_mm=_rms(one.displacement_mm[a] - other.displacement_mm[b]),
-        depth_change_rms_mm=_rms(one.depth_change_mm[a] - other.depth_change_mm[b]),
-        shape_rms_mm=_rms(one.shape_mm[a] - other.shape_mm[b]),
-    )
-
-
-def distance_mm(result: Difference) -> float:
-    """Mean distance of the targets from the camera along its axis, in the reference: what expansion is confused with, per unit."""
-    return float(result.reference.camera_from_dish.apply(result.table.nominal_mm)[:, 2].mean())
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

@@ -15,16 +15,8 @@ from numpy.typing import NDArray
 from dishmap import __version__
 from dishmap.compare import PAPER, SHAPE, Difference, DifferenceTable
 from dishmap.difference.difference_map import Considered, DifferenceMap
-from dishmap.difference_verdict import (
-    SIZES,
-    assumptions,
-    difference_verdict,
-    paper_facts,
-    set_aside,
-    unused_targets,
-    way_words,
-    with_sigma,
-)
+from dishmap.difference_assumptions import SIZES, assumptions, way_words
+from dishmap.difference_verdict import difference_verdict, paper_facts, set_aside, unused_targets, with_sigma
 from dishmap.page import bullet_list, charts, fact_grid, figure, page, paragraph, script_json, section, table, verdict_box
 from dishmap.plot.difference import change_map, misfit_histogram, misfit_map, ratio_map_chart, zernike_bars
 from dishmap.plot.difference_photograph import Arrows, arrows_of, arrows_svg
@@ -79,6 +71,8 @@ def _facts(facts: tuple[Fact, ...] | list[Fact]) -> str:
 
 def _shape(result: Difference) -> str:
     """Maps of the change of shape and of its sigma."""
+    if _still(result):
+        return ""
     rows, aside = result.table, set_aside(result.table)
     xy = rows.nominal_mm[:, :2]
     what = "the motion of the rigid parts" if result.joint is not None and result.joint.priors.rigid_ids else "the best-fit rigid motion"
@@ -90,9 +84,11 @@ def _shape(result: Difference) -> str:
     )
     if not np.isfinite(rows.sigma_shape_mm).all():
         return section("Change of shape", paragraph("The sigma of the change of shape is not known."), charts(shape))
+    used = ~aside if (~aside).any() else aside
+    left_out = " Targets put aside are left out." if aside.any() else ""
     sigma = figure(
-        sigma_map(xy, rows.sigma_shape_mm, "sigma of the change of shape (mm)"),
-        "Sigma of each target's change of shape. Errors of neighbours go together.",
+        sigma_map(xy[used], rows.sigma_shape_mm[used], "sigma of the change of shape (mm)"),
+        f"Sigma of each target's change of shape. Errors of neighbours go together.{left_out}",
         f"Map of its sigma, median {number(float(np.median(rows.sigma_shape_mm)))} mm.",
     )
     return section("Change of shape", charts(shape, sigma))
@@ -105,7 +101,7 @@ def _aside_words(rows: DifferenceTable) -> str:
 def _surface(result: Difference) -> str:
     """Coefficients of the robust surface through the change of shape, or through the paper's displacement."""
     name = next((name for name in (SHAPE, PAPER) if name in result.surfaces), None)
-    if name is None:
+    if name is None or _still(result):
         return ""
     fit = result.surfaces[name]
     sigma = np.sqrt(np.diag(fit.covariance))
@@ -115,14 +111,23 @@ def _surface(result: Difference) -> str:
     ]
     kind = {"zernike": "Zernike terms", "polynomial": "polynomial"}.get(fit.basis.kind, fit.basis.kind)
     kind += f" up to degree {fit.basis.degree}" if fit.basis.kind in ("zernike", "polynomial") else ""
+    # its disc ends at the outermost target, not at the rim as that of the terms above
+    kind += f" on a disc of {fit.basis.radius_mm:.4g} mm radius" if fit.basis.kind == "zernike" else ""
     through = "change of shape" if name == SHAPE else "paper's displacement"
     off = int(fit.off_surface.sum())
     rest = f", {targets(off)} off it ({id_list(fit.ids[fit.off_surface])})" if off else ""
-    left = paragraph(f"A {kind} over x and y of the dish frame, which leaves {number(fit.rms_mm)} mm rms{rest}.")
+    left = paragraph(f"Basis: {kind}, over x and y of the dish frame; {number(fit.rms_mm)} mm rms are left over{rest}.")
     return section(f"Robust surface through the {through}", left, table(("coefficient", "value", "sigma", "unit"), rows, (0, 3)))
 
 
+def _still(result: Difference) -> bool:
+    """Whether the shape was taken not to change, so that there is nothing to show of it."""
+    return result.joint is not None and result.joint.priors.still
+
+
 def _scene(result: Difference) -> str:
+    if _still(result):
+        return ""
     space = '<div id="difference3d" class="plot3d" role="img" aria-label="Interactive picture of the change of shape."></div>'
     caption = (
         f"The change of shape in space, along the nominal normals, drawn {exaggeration(result.table):g} times enlarged or at true scale, "
@@ -137,11 +142,12 @@ def _motion(result: Difference, image: NDArray[np.generic] | None) -> str:
     arrows = _arrows(result)
     longest = number(float(np.hypot(*rows.du_dv_px.T).max()))
     over = "over the current photograph" if image is not None else "in the picture's frame"
+    size = f"{arrows.factor:g} times enlarged" if arrows.factor > 1 else "at true scale"
     first, last = arrows.frame.columns, arrows.frame.rows
     picture = figure(
         arrows_svg(image, arrows, f"Arrows of the motion of {targets(len(rows))} in the picture, at most {longest} px."),
-        f"How each target's centre moved in the picture (du, dv), {over}, from where it was in the reference, {arrows.factor:g} times "
-        f"enlarged; the rigid motion is part of it. Columns {first[0]} to {first[1] - 1}, rows {last[0]} to {last[1] - 1}. "
+        f"How each target's centre moved in the picture (du, dv), {over}, from where it was in the reference, {size}; "
+        f"the rigid motion is part of it. Columns {first[0]} to {first[1] - 1}, rows {last[0]} to {last[1] - 1}. "
         "Hovering over an arrow tells its numbers.",
     )
     moved = figure(
@@ -161,7 +167,7 @@ def _arrows(result: Difference) -> Arrows:
     rows, camera = result.table, result.camera
     start = result.reference.center_px[_rows_of(result.reference.ids, rows.ids)]
     titles = tuple(
-        f"target {i}: du {u:+.{PX_DECIMALS}f}, dv {v:+.{PX_DECIMALS}f} px; displacement {with_sigma(d, s, ' mm', sign=True)}"
+        f"target {i}: du {_signed(u, PX_DECIMALS)}, dv {_signed(v, PX_DECIMALS)} px; displacement {with_sigma(d, s, ' mm', sign=True)}"
         for i, (u, v), d, s in zip(
             rows.ids.tolist(), rows.du_dv_px.tolist(), rows.displacement_mm.tolist(), rows.sigma_displacement_mm.tolist(), strict=True
         )
@@ -177,7 +183,7 @@ def _rows_of(ids: Array, wanted: Array) -> Array:
 
 def _terms(result: Difference) -> str:
     joint = result.joint
-    if joint is None or not joint.zernike_terms:
+    if joint is None or not joint.zernike_terms or joint.priors.still:
         return ""
     sigma = np.sqrt(np.diag(joint.zernike_covariance_mm2))
     labels = [f"{term_name(n, m).replace('_', ' ')} ({n}, {m})" for n, m in joint.zernike_terms]
@@ -188,7 +194,7 @@ def _terms(result: Difference) -> str:
         "Bars of the Zernike terms with their sigmas.",
     )
     rows = [
-        (label, f"{value:+.{MM_DECIMALS}f}", number(float(s)), f"{value / s:+.1f}" if s > 0 else UNKNOWN)
+        (label, _signed(value, MM_DECIMALS), number(float(s)), _signed(value / s, 1) if s > 0 else UNKNOWN)
         for label, value, s in zip(labels, joint.zernike_mm, sigma, strict=True)
     ]
     return section("Zernike terms", chart, table(("term (n, m)", "size (mm)", "sigma (mm)", "size / sigma"), rows, (0,)))
@@ -310,8 +316,12 @@ def _table(result: Difference) -> str:
     return section("All targets", about, table(heads, zip(*columns, strict=True), (len(heads) - 1,)))
 
 
-def _fixed(values: Array, decimals: int) -> list[str]:
+def _signed(value: float, decimals: int) -> str:
     # + 0.0 turns what rounds to minus zero into zero
+    return f"{round(float(value), decimals) + 0.0:+.{decimals}f}"
+
+
+def _fixed(values: Array, decimals: int) -> list[str]:
     return [f"{value:.{decimals}f}" for value in (np.round(values, decimals) + 0.0).tolist()]
 
 
@@ -333,7 +343,9 @@ def _version(library: str) -> str:
 
 
 def _scripts(result: Difference) -> list[str]:
-    """The library plotly.js and the call that draws the 3D picture."""
+    """The library plotly.js and the call that draws the 3D picture, where there is one."""
+    if _still(result):
+        return []
     from plotly.offline import get_plotlyjs
 
     rows = result.table

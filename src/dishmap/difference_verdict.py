@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from dishmap.compare import PAPER, Difference, DifferenceTable
-from dishmap.difference.difference_map import Considered, DifferenceMap
+from dishmap.difference.difference_map import DifferenceMap
 from dishmap.quality import MEANING, Quality, names
 from dishmap.verdict import Fact, Verdict, id_list, number, targets
 
@@ -20,32 +20,19 @@ Bools = NDArray[np.bool_]
 
 # A rigid motion is spoken of when chance would show it this rarely.
 RIGID_SIGNIFICANCE = 0.01
+# A value this many sigmas from zero or more is told from none (95 %).
+TOLD_SIGMAS = 1.96
 # Decimals written of a value: two digits of its sigma, within what a table can hold.
-SIGMA_DIGITS, MOST_DECIMALS = 2, 6
+SIGMA_DIGITS, MOST_DECIMALS = 2, 7
+# Below this a length in mm, or a sigma, is the rounding of an exact zero: far less than any photograph shows.
+ROUNDING = 1e-6
+# ... and what a tile can hold.
+TILE_DECIMALS = 4
+# Sigmas that had to be enlarged by this hide what the photographs cannot explain.
+DOUBTFUL_NOISE = 2.0
 # p values below this are written as a bound: the tail of a chi-square is not known to such depths.
 SMALLEST_P = 1e-12
 PPM = 1e6
-# How large an expansion and a drift of the focal length are made up to say what they would do.
-EXAMPLE_PPM = 10.0
-WAYS = {
-    "least_strain": "as a membrane does: points slide so that it strains the least",
-    "normal": "along its normals: points do not slide",
-    "axial": "along the boresight",
-    "any": "with any smooth slide along the surface",
-}
-# What the learnt sizes are, with the factor to the unit in which they are shown.
-SIZES = {
-    "normal_mm": ("displacement along the normal", 1.0, "mm"),
-    "slide_strain": ("strain by further slide", PPM, "ppm"),
-    "rough_mm": ("rise of each target on its own", 1.0, "mm"),
-    "print_strain": ("strain of each print on its own", PPM, "ppm"),
-    "expansion": ("uniform expansion", PPM, "ppm"),
-    "focal": ("focal drift", PPM, "ppm"),
-}
-STRAINS = {
-    "rigid": "The surface was taken not to stretch, and prints to keep their size, as was given.",
-    "free": "The size of prints was taken to say nothing of depth, as was given: prints may have stretched by any amount.",
-}
 
 
 @dataclass(frozen=True)
@@ -71,13 +58,12 @@ def with_sigma(value: float, sigma: float, unit: str, sign: bool = False) -> str
 
     The unit brings its own space.
     """
-    if not (np.isfinite(sigma) and sigma > 0):
+    if not (np.isfinite(sigma) and sigma > ROUNDING):
         return f"{'+' if sign and value > 0 else ''}{number(value)}{unit}"
     decimals = int(np.clip(SIGMA_DIGITS - 1 - np.floor(np.log10(sigma)), 0, MOST_DECIMALS))
-    shown = f"{value:{'+' if sign else ''}.{decimals}f}"
-    # a sigma or value below the last decimal would read as zero
-    small = sigma < 10.0**-MOST_DECIMALS
-    return f"{number(value)} ± {number(sigma)}{unit}" if small else f"{shown} ± {sigma:.{decimals}f}{unit}"
+    # + 0.0 turns what rounds to minus zero into zero
+    shown = f"{round(value, decimals) + 0.0:{'+' if sign else ''}.{decimals}f}"
+    return f"{shown} ± {sigma:.{decimals}f}{unit}"
 
 
 def rms_with_sigma(value_mm: Array, factor: Array, own_mm2: Array) -> tuple[float, float]:
@@ -94,8 +80,15 @@ def rms_with_sigma(value_mm: Array, factor: Array, own_mm2: Array) -> tuple[floa
         return 0.0, 0.0
     variance = float(4 * value_mm @ covariance @ value_mm + 2 * (covariance**2).sum()) / n**2
     spread = variance / (4 * expected)
-    mean = np.sqrt(max(expected - spread, 0.0))
-    return float(np.sqrt(square)), float(np.sqrt(max(expected + square - 2 * mean * np.sqrt(square), 0.0)))
+    mean = max(expected - spread, 0.0) ** 0.5
+    return square**0.5, max(expected + square - 2 * mean * square**0.5, 0.0) ** 0.5
+
+
+def shape_rms(joint: DifferenceMap) -> tuple[float, float]:
+    """Root mean square of the change of shape, mm, over the targets that were used, with its error."""
+    used = (joint.quality & int(Quality.OUTLIER)) == 0
+    used |= not used.any()
+    return rms_with_sigma(joint.shape_mm[used], joint.shape_factor[used], joint.shape_own_mm2[used])
 
 
 def set_aside(table: DifferenceTable) -> Bools:
@@ -132,26 +125,17 @@ def _length(vector: Array, covariance: Array) -> tuple[float, float]:
     length = float(np.linalg.norm(vector))
     if length == 0:
         return 0.0, float(np.sqrt(max(np.linalg.eigvalsh(covariance)[-1], 0.0)))
-    return length, float(np.sqrt(max(vector @ covariance @ vector, 0.0))) / length
+    return length, max(float(vector @ covariance @ vector), 0.0) ** 0.5 / length
 
 
 def p_words(p_value: float) -> str:
     """`p = 0.61`, or a bound where it is tiny."""
-    return f"p = {number(p_value)}" if p_value >= SMALLEST_P else f"p < {SMALLEST_P:g}"
+    return f"p = {p_value:.2g}" if p_value >= SMALLEST_P else f"p < {SMALLEST_P:g}"
 
 
 def scale_open(joint: DifferenceMap) -> bool:
     """Whether the scale of the whole picture changed, nothing is known of expansion, and so motion and expansion are not told apart."""
     return joint.priors.expansion_ppm is None and joint.expansion_assumed[1] > 0
-
-
-def way_words(joint: DifferenceMap, one: Considered, flat: bool) -> str:
-    """One way of moving in plain words; flat: the nominal surface is a plane."""
-    if joint.priors.still:
-        return "as a rigid body"
-    if flat and one.way != "any":
-        return "in and out; on a plane that makes no point slide"
-    return WAYS[one.way]
 
 
 def unused_targets(result: Difference) -> list[tuple[int, str]]:
@@ -171,20 +155,28 @@ def _headline(result: Difference) -> str:
     if joint is None:
         rms, shape = _rms(table.displacement_mm), _rms(table.shape_mm)
         return (
-            f"By the paper's method the surface was displaced by {number(rms)} mm rms, {number(shape)} mm rms of it change of shape; "
-            "whether that is significant the method does not say."
+            f"By the paper's method the surface was displaced by {number(rms)} mm rms; without the best-fit rigid motion "
+            f"{number(shape)} mm rms are left. Whether that is significant the method does not say."
         )
     test = joint.significance
     if joint.priors.still:
-        against = f"; but the photographs contradict a rigid body ({p_words(test.p_value)})" if test.changed else ""
-        return f"Taken as a rigid body, as was given, the surface {_motion(joint)}{against}."
-    size = with_sigma(*rms_with_sigma(joint.shape_mm, joint.shape_factor, joint.shape_own_mm2), " mm")
-    whole = f"as a whole the surface {_motion(joint)}"
+        against = f" But the photographs contradict a rigid body ({p_words(test.p_value)})." if test.changed else ""
+        return f"Taken as a rigid body, as was given, the surface {_motion(joint)}.{_doubt(joint) or against}"
+    size = with_sigma(*shape_rms(joint), " mm")
+    whole = f"as a whole the surface {_motion(joint)}.{_doubt(joint)}"
     if not test.changed:
-        return f"No significant change of shape: {size} rms, {p_words(test.p_value)}; {whole}."
+        return f"No significant change of shape: {size} rms, {p_words(test.p_value)}; {whole}"
     row = largest_row(table)
     most = with_sigma(table.shape_mm[row], table.sigma_shape_mm[row], " mm", sign=True)
-    return f"The shape changed by {size} rms, most at target {table.ids[row]} ({most}); {whole}."
+    return f"The shape changed by {size} rms, most at target {table.ids[row]} ({most}); {whole}"
+
+
+def _doubt(joint: DifferenceMap) -> str:
+    """What must stand beside any verdict when the targets do not fit it."""
+    times = float(np.sqrt(joint.noise_factor))
+    if times < DOUBTFUL_NOISE:
+        return ""
+    return f" But the targets scatter {number(times)} times more than their sigmas allow: trust none of this before that is explained."
 
 
 def _motion(joint: DifferenceMap) -> str:
@@ -194,7 +186,10 @@ def _motion(joint: DifferenceMap) -> str:
         return f"moved along the line of sight or changed its size, which one camera cannot tell apart (scale changed by {percent})"
     if not rigid.significant:
         return "did not move significantly"
-    return f"moved by {with_sigma(*rigid.moved_mm, ' mm')} and turned by {with_sigma(*rigid.turned_deg, '°')}"
+    both = (("moved", rigid.moved_mm, " mm"), ("turned", rigid.turned_deg, "°"))
+    # together they may be certain where neither is alone
+    told = [part for part in both if part[1][0] >= TOLD_SIGMAS * part[1][1]] or both
+    return " and ".join(f"{verb} by {with_sigma(*size, unit)}" for verb, size, unit in told)
 
 
 def _facts(result: Difference) -> list[Fact]:
@@ -204,21 +199,24 @@ def _facts(result: Difference) -> list[Fact]:
     facts = [Fact("Targets compared", f"{len(table)} of {len(result.pattern)}", f"{aside} put aside, {lost} not in both states")]
     row = largest_row(table)
     x, y, _ = table.nominal_mm[row]
+    side = "towards" if table.shape_mm[row] >= 0 else "away from"
     at = Fact(
         "Largest change of shape",
-        with_sigma(table.shape_mm[row], np.nan, " mm", sign=True),
-        f"{_give_or_take(table.sigma_shape_mm[row], ' mm')}target {table.ids[row]} at x {x:.0f}, y {y:.0f} mm",
+        _brief(abs(table.shape_mm[row]), table.sigma_shape_mm[row], " mm"),
+        f"{_give_or_take(table.sigma_shape_mm[row], ' mm')}{side} the camera's side, target {table.ids[row]} at x {x:.0f}, y {y:.0f} mm",
     )
     if joint is None:
-        return [*facts, Fact("Change of shape, rms", f"{number(_rms(table.shape_mm))} mm", "best-fit rigid motion removed"), at]
-    size, sigma = rms_with_sigma(joint.shape_mm, joint.shape_factor, joint.shape_own_mm2)
+        return [*facts, Fact("Change of shape, rms", _brief(_rms(table.shape_mm), np.nan, " mm"), "best-fit rigid motion removed"), at]
+    if joint.priors.still:
+        return [*facts, *_joint_facts(joint)]
+    size, sigma = shape_rms(joint)
     by = "motion of the rigid parts" if joint.priors.rigid_ids else "best-fit rigid motion"
     median = number(float(np.median(table.sigma_shape_mm)))
     return [
         *facts,
         Fact(
             "Change of shape, rms",
-            f"{number(size)} mm",
+            _brief(size, sigma, " mm"),
             f"{_give_or_take(sigma, ' mm')}{by} removed; sigma of one target {median} mm (median)",
         ),
         at,
@@ -229,13 +227,16 @@ def _facts(result: Difference) -> list[Fact]:
 def _joint_facts(joint: DifferenceMap) -> list[Fact]:
     test, rigid = joint.significance, rigid_of(joint)
     best = max(joint.considered, key=lambda c: c.weight)
-    given = "assumed" if joint.expansion_assumed[1] == 0 else f"beforehand {_ppm(joint.expansion_assumed)}"
+    given = "assumed" if joint.expansion_assumed[1] == 0 else f"beforehand {ppm(joint.expansion_assumed)}"
     drift = "assumed" if joint.priors.focal_drift == 0 else f"beforehand 0 ± {number(PPM * joint.priors.focal_drift)} ppm"
-    p_value = number(test.p_value) if test.p_value >= SMALLEST_P else f"< {SMALLEST_P:g}"
     return [
-        Fact("p value", p_value, f"of no change of shape: chi-square {number(test.chi_square)}, {test.degrees} degrees of freedom"),
-        Fact("Rigid motion", f"{number(rigid.moved_mm[0])} mm", _components(rigid.move_mm, rigid.sigma_move_mm, " mm")),
-        Fact("Rigid turn", f"{number(rigid.turned_deg[0])}°", _components(rigid.turn_deg, rigid.sigma_turn_deg, "°")),
+        Fact(
+            "p value",
+            p_words(test.p_value).removeprefix("p ").removeprefix("= "),
+            f"of no change of shape: chi-square {number(test.chi_square)}, {test.degrees} degrees of freedom",
+        ),
+        Fact("Rigid motion", _brief(*rigid.moved_mm, " mm"), _components(rigid.move_mm, rigid.sigma_move_mm, " mm")),
+        Fact("Rigid turn", _brief(*rigid.turned_deg, "°"), _components(rigid.turn_deg, rigid.sigma_turn_deg, "°")),
         _share("Uniform expansion", joint.expansion, given),
         _share("Focal drift", joint.focal_drift, drift),
         Fact("Ways of moving that count", str(len(joint.considered)), f"the best has {best.weight:.0%} of the weight"),
@@ -244,18 +245,26 @@ def _joint_facts(joint: DifferenceMap) -> list[Fact]:
 
 
 def _share(name: str, value: tuple[float, float], before: str) -> Fact:
-    return Fact(name, f"{number(PPM * value[0])} ppm", f"{_give_or_take(PPM * value[1], ' ppm')}{before}")
+    return Fact(name, _brief(PPM * value[0], PPM * value[1], " ppm"), f"{_give_or_take(PPM * value[1], ' ppm')}{before}")
+
+
+def _brief(value: float, sigma: float, unit: str) -> str:
+    """A value short enough for a tile: three digits, or fewer where its sigma says that they mean nothing."""
+    known = [float(size) for size in (abs(value) / 10, sigma) if np.isfinite(size) and size > 0]
+    decimals = int(np.clip(SIGMA_DIGITS - 1 - np.floor(np.log10(float(max(known, default=10.0)))), 0, TILE_DECIMALS))
+    return f"{round(float(value), decimals) + 0.0:.{decimals}f}{unit}"
 
 
 def _give_or_take(sigma: float, unit: str) -> str:
-    return f"± {number(float(sigma))}{unit}; " if np.isfinite(sigma) and sigma > 0 else ""
+    return f"± {number(float(sigma))}{unit}; " if np.isfinite(sigma) and sigma > ROUNDING else ""
 
 
 def _components(values: Array, sigmas: Array, unit: str) -> str:
     return ", ".join(f"{axis} {with_sigma(float(v), float(s), unit)}" for axis, v, s in zip("xyz", values, sigmas, strict=True))
 
 
-def _ppm(value: tuple[float, float]) -> str:
+def ppm(value: tuple[float, float]) -> str:
+    """A share (mean, sigma) per unit in parts per million."""
     return with_sigma(PPM * value[0], PPM * value[1], " ppm")
 
 
@@ -299,7 +308,7 @@ def _joint_warnings(joint: DifferenceMap) -> list[str]:
             f"The scale of the whole picture changed by {number(100 * part)} %. A motion of {number(depth * part)} mm along the line of "
             f"sight and an expansion of {number(PPM * part)} ppm look the same to one camera, and nothing was said of expansion, so that "
             "either may be true and the sigmas of displacement, shape and rigid motion hold both. Say how much the surface may have "
-            "expanded to tell them apart."
+            "expanded (`--expansion-ppm`) to tell them apart."
         )
     if not joint.converged:
         out.append("Not every way of moving that was weighed converged; its numbers are those of the last step.")
@@ -313,74 +322,6 @@ def _joint_warnings(joint: DifferenceMap) -> list[str]:
     return out
 
 
-def assumptions(joint: DifferenceMap, flat: bool) -> list[str]:
-    """What the estimate rests on and what one camera cannot see, in sentences; flat: the nominal surface is a plane."""
-    best = max(joint.considered, key=lambda c: c.weight)
-    out = [_expansion_words(joint), _focal_words(joint), _strain_words(joint, best)]
-    out += _smoothness_words(joint, best)
-    if joint.priors.slide is not None and not joint.priors.still:
-        out.append(f"The surface was taken to move {way_words(joint, best, flat)}, as was given.")
-    if joint.priors.rigid_ids:
-        out.append(f"Targets {id_list(joint.priors.rigid_ids)} were taken to sit on rigid parts; their motion is the rigid motion.")
-    return [*out, *_unseen(joint)]
-
-
-def _expansion_words(joint: DifferenceMap) -> str:
-    found, assumed = _ppm(joint.expansion), _ppm(joint.expansion_assumed)
-    if joint.priors.expansion_ppm is not None:
-        return f"Expansion: {assumed} was given beforehand; with the photographs it is {found}."
-    if scale_open(joint):
-        return f"Expansion: nothing was said of it and the picture's scale changed, so {assumed} was assumed; it is {found}."
-    depth = EXAMPLE_PPM / PPM * float(joint.camera_from_dish.translation_mm[2])
-    return (
-        "Expansion: none was assumed, as nothing was said of it and the scale of the picture hardly changed. An expansion by "
-        f"{EXAMPLE_PPM:g} ppm would pass for a motion of {number(depth)} mm towards the camera."
-    )
-
-
-def _focal_words(joint: DifferenceMap) -> str:
-    sigma = joint.priors.focal_drift
-    if sigma > 0:
-        found = _ppm(joint.focal_drift)
-        return f"Focal length: a drift of 0 ± {number(PPM * sigma)} ppm was allowed for; with the photographs it is {found}."
-    depth = EXAMPLE_PPM / PPM * float(joint.camera_from_dish.translation_mm[2])
-    return (
-        f"Focal length: taken as unchanged. A drift of {EXAMPLE_PPM:g} ppm (the camera warms up) would pass for a motion of "
-        f"{number(depth)} mm along the line of sight."
-    )
-
-
-def _strain_words(joint: DifferenceMap, best: Considered) -> str:
-    strain = joint.priors.strain
-    if joint.priors.still:
-        return "Strain: the surface was taken to move as a rigid body, as was given, so that it neither bends nor stretches."
-    if isinstance(strain, str):
-        return f"Strain: {STRAINS[strain][:1].lower()}{STRAINS[strain][1:]}"
-    slide, prints = (f"{number(PPM * best.sizes[name])} ppm" for name in ("slide_strain", "print_strain"))
-    if strain is not None:
-        return f"Strain: a standard deviation of {slide} was given."
-    return f"Strain: learnt from the photographs. Prints stretched by {prints} each on its own, and the slide added {slide} (rms)."
-
-
-def _smoothness_words(joint: DifferenceMap, best: Considered) -> list[str]:
-    if joint.priors.still:
-        return []
-    far = "given" if joint.priors.amplitude_mm is not None else "learnt"
-    long = "given" if joint.priors.length_mm is not None else "weighed"
-    return [
-        f"Smoothness: displacement of {number(best.sizes['normal_mm'])} mm ({far}) that changes over {number(best.length_mm)} mm ({long}; "
-        "values of the best way of moving). A sharper bend between targets would go unseen, and no sigma holds it."
-    ]
-
-
-def _unseen(joint: DifferenceMap) -> list[str]:
-    return [
-        "One camera cannot tell a motion of the surface from one of the camera: the rigid motion is that of one relative to the other.",
-        "It sees depth by the size of prints. What enlarges all of them alike (expansion, a longer focal length) looks like an approach; "
-        "what stretches one print looks like an approach of that target, and its neighbours are all that speaks against it.",
-    ]
-
-
 def paper_facts(result: Difference) -> list[Fact]:
     """Numbers of the paper's method, and how far it is from the joint estimate where there is one."""
     paper, table = result.paper, result.tables[PAPER]
@@ -388,13 +329,13 @@ def paper_facts(result: Difference) -> list[Fact]:
         return []
     common = f"{number(paper.common_depth_change_mm)} mm"
     facts = [
-        Fact("Displacement, rms", f"{number(_rms(table.displacement_mm))} mm", f"{targets(len(table))}, along the normal"),
-        Fact("Change of shape, rms", f"{number(_rms(table.shape_mm))} mm", "best-fit rigid motion removed"),
+        Fact("Displacement, rms", _brief(_rms(table.displacement_mm), np.nan, " mm"), f"{targets(len(table))}, along the normal"),
+        Fact("Change of shape, rms", _brief(_rms(table.shape_mm), np.nan, " mm"), "best-fit rigid motion removed"),
         Fact("Scale of the registration", f"{paper.registration.scale:.6f}", f"by itself a depth change of {common}"),
         Fact("Pairs used", f"{int((paper.confidence > 0).sum())} of {len(paper.ratios)}", f"up to {number(paper.reach_mm)} mm apart"),
     ]
     if result.joint is not None:
         _, ours, theirs = np.intersect1d(result.joint.ids, table.ids, return_indices=True)
         gap = _rms(result.joint.shape_mm[ours] - table.shape_mm[theirs])
-        facts.append(Fact("From the joint estimate, rms", f"{number(gap)} mm", "of the two changes of shape"))
+        facts.append(Fact("From the joint estimate, rms", _brief(gap, np.nan, " mm"), "of the two changes of shape"))
     return facts

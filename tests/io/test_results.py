@@ -288,7 +288,7 @@ def test_inputs_that_have_gone_are_told(photograph: tuple[np.ndarray, Map], tmp_
 
 
 def test_old_points_of_another_frame_do_not_stay(tmp_path: Path) -> None:
-    write_results(tmp_path, {"points.csv": "new", SPACECRAFT_FILE: "new"})
+    write_results(tmp_path, {"points.csv": "new", SPACECRAFT_FILE: "new", "measurement.npz": b"new"})
     (tmp_path / "mine.txt").write_text("mine")
     write_results(tmp_path, {"points.csv": "newer"})
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.txt", "points.csv"]

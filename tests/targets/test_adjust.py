@@ -1,4 +1,4 @@
-"""The adjustment: small systems against numpy, priors, convergence, and a batch against its targets one by one."""
+"""The adjustment: priors, convergence, and a batch against its targets one by one."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scenes import PLAIN, facing_towards, group_of, moved
 
@@ -19,21 +17,18 @@ from dishmap.targets.adjust import (
     Adjusted,
     adjust,
     by_target,
-    inverse_scaled,
     prior_terms,
-    solve_scaled,
 )
 from dishmap.targets.builders import multi_circular, plate, ring
 from dishmap.targets.edges import Poses
 from dishmap.targets.pixels import BLUR, GEOMETRY, OFFSET_MM, OFFSET_PX, TONE, RingPixels, Weighting
+from dishmap.targets.solve import inverse_scaled
 from dishmap.targets.stages import Group, layout
 from dishmap.targets.start import nominal_poses
 from dishmap.transforms import angle_between_rad, rotation_from_vector
 
 Array = NDArray[np.float64]
 
-# Solving after scaling leaves rounding times the condition of the scaled matrix.
-SOLVED_PART = 1e-6
 # An adjustment stops when little is left to do in the mean square of all parameters; one of them may hold all of it.
 STOPPED_SIGMAS = STEP_SIGMAS * GEOMETRY**0.5
 # What two such fits of the same pixels from different sides differ by, root mean square.
@@ -41,34 +36,6 @@ EARLY_SIGMAS = 0.1
 DISTANCE_MM = 500.0
 NOISE_GREY = 2.0
 RING = ring(2.0, 1.2)
-
-
-@st.composite
-def scaled_systems(draw: st.DrawFn) -> tuple[Array, Array]:
-    """Positive definite systems whose unknowns have scales from 1e-4 to 1e4, as mm, rad and px have."""
-    rng = np.random.default_rng(draw(st.integers(0, 10_000)))
-    columns = rng.standard_normal((3, 40, 5)) * 10.0 ** rng.uniform(-4, 4, (3, 1, 5))
-    return np.swapaxes(columns, 1, 2) @ columns, rng.standard_normal((3, 5))
-
-
-@given(scaled_systems())
-def test_scaled_solution_and_inverse_are_those_of_numpy(system: tuple[Array, Array]) -> None:
-    matrix, right = system
-    scale = 1 / np.sqrt(np.diagonal(matrix, axis1=1, axis2=2))
-    expected = np.linalg.solve(matrix, right[..., None])[..., 0]
-    np.testing.assert_allclose(solve_scaled(matrix, right) / scale, expected / scale, atol=SOLVED_PART * np.abs(expected / scale).max())
-    unit = inverse_scaled(matrix) / scale[:, :, None] / scale[:, None, :]
-    np.testing.assert_allclose(unit, np.linalg.inv(matrix) / scale[:, :, None] / scale[:, None, :], atol=SOLVED_PART * np.abs(unit).max())
-
-
-def test_a_system_that_cannot_be_solved_moves_nothing_and_spoils_no_other() -> None:
-    good = np.diag([2.0, 4.0])
-    matrix = np.stack([good, np.full((2, 2), np.nan), np.zeros((2, 2))])
-    right = np.array([[2.0, 4.0], [1.0, 1.0], [0.0, 0.0]])
-    np.testing.assert_allclose(solve_scaled(matrix, right), [[1, 1], [0, 0], [0, 0]], atol=1e-9)
-    inverse = inverse_scaled(matrix[:2])
-    np.testing.assert_allclose(inverse[0], np.diag([0.5, 0.25]))
-    assert np.isnan(inverse[1]).all()
 
 
 def test_sums_by_target() -> None:

@@ -57,7 +57,7 @@ def test_pixels_near_a_neighbour_are_left_out_and_no_others(gap_px: float) -> No
     pattern, poses = two_rings(gap_px)
     _, pixels = layout(np.zeros((340, 420), np.uint8), group_of(CAMERA, RING, poses, BLUR_PX), BLUR_PX, BLUR_PX)
     ink = ink_of(CAMERA, pattern, [(RING, np.arange(2), poses)])
-    left = clear_of_neighbours(pixels, np.arange(2), ink, BLUR_PX)
+    left = clear_of_neighbours(pixels, np.arange(2), ink, np.full(2, BLUR_PX))
     u = pixels.patches.anchor_px[:, :1] + pixels.s * pixels.patches.scale_px[:, None]
     v = pixels.patches.anchor_px[:, 1:] + pixels.t * pixels.patches.scale_px[:, None]
     other = CAMERA.project(poses.position_mm)[::-1]
@@ -72,7 +72,7 @@ def test_pixels_near_a_neighbour_are_left_out_and_no_others(gap_px: float) -> No
 def test_far_neighbours_cost_nothing() -> None:
     pattern, poses = two_rings(30.0)
     _, pixels = layout(np.zeros((340, 420), np.uint8), group_of(CAMERA, RING, poses, BLUR_PX), BLUR_PX, BLUR_PX)
-    assert clear_of_neighbours(pixels, np.arange(2), ink_of(CAMERA, pattern, [(RING, np.arange(2), poses)]), BLUR_PX) is pixels
+    assert clear_of_neighbours(pixels, np.arange(2), ink_of(CAMERA, pattern, [(RING, np.arange(2), poses)]), np.full(2, BLUR_PX)) is pixels
 
 
 def test_a_ring_of_which_little_is_left_counts_as_occluded() -> None:
@@ -82,7 +82,7 @@ def test_a_ring_of_which_little_is_left_counts_as_occluded() -> None:
     ink, middle = ink_of(CAMERA, pattern, [(RING, np.arange(2), poses)]), CAMERA.project(poses.position_mm)
     away = 10 * float(ink.reach_px[0]) + 1
     wide = Ink(ink.target, middle[::-1] + [[-away, 0.0], [away, 0.0]], ink.metric / 100, 10 * ink.reach_px)
-    left = clear_of_neighbours(pixels, np.arange(2), wide, BLUR_PX)
+    left = clear_of_neighbours(pixels, np.arange(2), wide, np.full(2, BLUR_PX))
     assert left.blocked is not None
     np.testing.assert_array_equal(left.used, pixels.used)
     assert (left.blocked.sum(axis=1) > (1 - LEAST_FREE) * pixels.used.sum(axis=1)).all()

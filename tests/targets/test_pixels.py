@@ -17,13 +17,13 @@ from dishmap.targets.adjust import Batch
 from dishmap.targets.bound import PIXEL_VARIANCE_PX2
 from dishmap.targets.builders import concentric, disc, multi_circular, ring
 from dishmap.targets.edges import MISFIT_PX, Poses
+from dishmap.targets.light import LIGHT, light_columns, solve_light, toned
 from dishmap.targets.pattern import TargetKind
 from dishmap.targets.pixels import (
     BAND_BLURS,
     BLUR,
     GEOMETRY,
     LARGEST_CURVED,
-    LIGHT,
     OFFSET_MM,
     OFFSET_PX,
     TONE,
@@ -31,12 +31,9 @@ from dishmap.targets.pixels import (
     RingSums,
     Weighting,
     coverage_columns,
-    light_columns,
     normal_distribution,
     ring_sums,
     rings_of,
-    solve_light,
-    toned,
     without_light,
 )
 from dishmap.targets.stages import Group, layout

@@ -1,7 +1,11 @@
-"""Bundle adjustment of one camera and the poses of a board: Levenberg-Marquardt with the poses eliminated view by view.
+"""Bundle adjustment of one camera, the board's shape and its poses: Levenberg-Marquardt, poses eliminated view by view.
 
 Each view's pose touches only its own residuals, so the normal equations are an arrow: with the poses eliminated (Schur
-complement) there is one small system for the camera, whatever the number of views (Triggs et al. 2000, section 6).
+complement) there is one small system for camera and board, whatever the number of views (Triggs et al. 2000, section 6).
+Camera parameters and the board's bends are called *shared* here: each view has them in common.
+
+Most sensors are read row by row, and what moves meanwhile is seen sheared. A view may therefore have a drift: the small
+motion (turn and shift) of the board against the camera from the first row to the last.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ from dishmap.transforms import cross_matrix, rotation_from_vector
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-POSE = 6
+POSE, DRIFT = 6, 6
 # Powers of the radius with which k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 act, relative to the radius itself.
 OPENCV_POWERS, FISHEYE_POWERS = (2, 4, 1, 1, 6, 2, 4, 6, 1, 3, 1, 3), (2, 4, 6, 8)
 STIFFNESS = 0.5
@@ -37,11 +41,17 @@ SMALLEST_SCALE_PX = 0.01
 
 @dataclass(frozen=True)
 class BoardCorners:
-    """Corners of all views in one run: pixels (M, 2), board_mm (M, 3), and where each view starts (V + 1,)."""
+    """Corners of all views in one run: pixels (M, 2), board_mm (M, 3), and where each view starts (V + 1,).
+
+    bends (M, F): height in mm of each corner over the flat board when a bend has size 1 mm (`board.bends_of`). time (M,): when it
+    was read, from -0.5 at the picture's first row to 0.5 at its last; None where all is seen at once, so that views have no drift.
+    """
 
     pixels: Array
     board_mm: Array
     bounds: NDArray[np.int64]
+    bends: Array
+    time: Array | None = None
 
     @property
     def slices(self) -> list[slice]:
@@ -56,113 +66,166 @@ class BoardCorners:
 
 @dataclass(frozen=True)
 class Bundle:
-    """A camera and the board's pose in each view: rotation (V, 3, 3), translation_mm (V, 3), camera from board."""
+    """A camera, the board's pose in each view, camera from board: rotation (V, 3, 3), translation_mm (V, 3), and its bends (F,) in mm.
+
+    drift (V, 6): of each view, turn in rad about the board's origin and shift in mm over the time of one picture.
+    """
 
     camera: Camera
     rotation: Array
     translation_mm: Array
+    bend_mm: Array
+    drift: Array
+
+    @property
+    def shared(self) -> Array:
+        """Camera parameters, then bends (P + F,)."""
+        return np.concatenate([self.camera.parameters, self.bend_mm])
 
     def residuals(self, corners: BoardCorners) -> Array:
         """Measured minus projected (M, 2), px; NaN where the lens model does not reach."""
-        return corners.pixels - self.camera.project(self._points(corners))
+        return corners.pixels - self.camera.project(self.seen(self.turned(corners), corners))
 
-    def _points(self, corners: BoardCorners) -> Array:
-        view = corners.view
-        return np.einsum("mij,mj->mi", self.rotation[view], corners.board_mm) + self.translation_mm[view]
+    def seen(self, turned: Array, corners: BoardCorners) -> Array:
+        """Turned corners (M, 3) where the camera sees them, in its frame."""
+        shifted = turned + self.translation_mm[corners.view]
+        if corners.time is None:
+            return shifted
+        drift = self.drift[corners.view]
+        return shifted + corners.time[:, None] * (np.cross(drift[:, :3], turned) + drift[:, 3:])
 
-    def moved(self, free: Mask, camera_step: Array, pose_steps: Array) -> Bundle:
-        """Return the bundle after a step: camera parameters added, rotations turned on the left, translations added."""
-        parameters = self.camera.parameters
-        parameters[free] += camera_step
+    def turned(self, corners: BoardCorners) -> Array:
+        """Corners of the bent board (M, 3), turned as the camera sees them but not yet shifted."""
+        board = corners.board_mm.copy()
+        board[:, 2] += corners.bends @ self.bend_mm
+        return np.einsum("mij,mj->mi", self.rotation[corners.view], board)
+
+    def moved(self, free: Mask, shared_step: Array, pose_steps: Array) -> Bundle:
+        """Return the bundle after a step: shared parameters added, rotations turned on the left, translations and drifts added."""
+        shared = self.shared
+        shared[free] += shared_step
+        count = len(self.camera.parameters)
         rotation = rotation_from_vector(pose_steps[:, :3]) @ self.rotation
-        return Bundle(self.camera.with_parameters(parameters), rotation, self.translation_mm + pose_steps[:, 3:])
+        drift = self.drift + pose_steps[:, POSE:] if pose_steps.shape[1] > POSE else self.drift
+        translation = self.translation_mm + pose_steps[:, 3:POSE]
+        return Bundle(self.camera.with_parameters(shared[:count]), rotation, translation, shared[count:], drift)
+
+    def of_views(self, keep: Mask) -> Bundle:
+        """The bundle of some of the views (V,)."""
+        return Bundle(self.camera, self.rotation[keep], self.translation_mm[keep], self.bend_mm, self.drift[keep])
 
 
 @dataclass(frozen=True)
 class Prior:
-    """How freely camera parameters may move: it decides only what the corners leave open.
+    """How freely shared parameters may move: it decides only what the corners leave open.
 
     About `expected` (P,), the focal lengths may move by themselves and the principal point by the half picture; at `radius` (tangent
     off the axis, of the farthest corner), each lens term may move a point by STIFFNESS of its distance from the axis.
     Without this the terms of a rational lens, which can stand in for each other, run away, and so does the focal length when
-    all views are alike. noise_px: sigma of one coordinate, which says what a corner weighs against the prior.
+    all views are alike. Bends may be bend_mm large (sigma), about none, and drifts as `drift` (6,) says. noise_px: sigma of one
+    coordinate, which says what a corner weighs against the prior.
     """
 
     expected: Array
     radius: float
     noise_px: float
+    bend_mm: float
+    drift: Array
 
-    def precision(self, camera: Camera) -> Array:
-        """Precision of each parameter times the noise's variance (P,), in px^2 over the parameter's unit squared."""
+    def precision(self, bundle: Bundle) -> Array:
+        """Precision of each shared parameter times the noise's variance (P + F,), in px^2 over the parameter's unit squared."""
+        camera = bundle.camera
         powers = (FISHEYE_POWERS if camera.model == "fisheye" else OPENCV_POWERS)[: camera.distortion.size]
         lens = STIFFNESS / self.radius ** np.array(powers, dtype=float)
-        return (self.noise_px / np.concatenate([self.expected[:2], [camera.width_px / 2, camera.height_px / 2], lens])) ** 2
+        bends = np.full(len(bundle.bend_mm), self.bend_mm)
+        return (self.noise_px / np.concatenate([self.expected[:2], [camera.width_px / 2, camera.height_px / 2], lens, bends])) ** 2
 
-    def pull(self, camera: Camera) -> Array:
-        """Distance of the parameters from what is expected (P,)."""
-        return camera.parameters - self.expected
+    def pull(self, bundle: Bundle) -> Array:
+        """Distance of the parameters from what is expected (P + F,)."""
+        return np.concatenate([bundle.camera.parameters - self.expected, bundle.bend_mm])
 
-    def cost(self, camera: Camera) -> float:
+    def cost(self, bundle: Bundle) -> float:
         """What it adds to the sum of squares, px^2."""
-        return float(self.precision(camera) @ self.pull(camera) ** 2)
+        return float(self.precision(bundle) @ self.pull(bundle) ** 2 + (bundle.drift**2 @ self.drift_precision).sum())
+
+    @property
+    def drift_precision(self) -> Array:
+        """Precision of a view's drift times the noise's variance (6,)."""
+        return (self.noise_px / self.drift) ** 2
 
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Blocks of J^T W J and J^T W r for each view: camera (V, P, P), mixed (V, P, 6), pose (V, 6, 6), and both right sides.
+    """Blocks of J^T W J and J^T W r for each view: shared (V, S, S), mixed (V, S, K), pose (V, K, K), and both right sides.
 
-    prior (P,), prior_side (P,): what `Prior` adds to the camera's own block, once for all views.
+    A view has K = 6 parameters of its own, 12 with drift, whose prior is in `pose` and `pose_side`. prior (S,), prior_side (S,): what `Prior` adds to the shared block, once for all views.
     """
 
-    camera: Array
+    shared: Array
     mixed: Array
     pose: Array
-    camera_side: Array
+    shared_side: Array
     pose_side: Array
     prior: Array
     prior_side: Array
 
 
 def normal_equations(bundle: Bundle, corners: BoardCorners, free: Mask, weights: Array, prior: Prior) -> NormalEquations:
-    """Linearise the projections of a bundle; weights (M,), free (P,) tells which camera parameters are estimated."""
-    turned = np.einsum("mij,mj->mi", bundle.rotation[corners.view], corners.board_mm)
-    pixels, by_point, by_camera = bundle.camera.project_with_jacobians(turned + bundle.translation_mm[corners.view])
+    """Linearise the projections of a bundle; weights (M,), free (P + F,) tells which shared parameters are estimated."""
+    turned = bundle.turned(corners)
+    pixels, by_point, by_camera = bundle.camera.project_with_jacobians(bundle.seen(turned, corners))
     residual = corners.pixels - pixels
-    rows = np.concatenate([by_camera[..., free], -by_point @ cross_matrix(turned), by_point, residual[..., None]], axis=-1)
+    by_turned = by_point
+    if corners.time is not None:
+        by_turned = by_point @ (np.eye(3) + corners.time[:, None, None] * cross_matrix(bundle.drift[corners.view, :3]))
+    upwards = (by_turned @ bundle.rotation[corners.view][..., 2:]) * corners.bends[:, None]
+    by_shared = np.concatenate([by_camera, upwards], axis=-1)[..., free]
+    turn = cross_matrix(turned)
+    by_view = [-by_turned @ turn, by_point]
+    if corners.time is not None:
+        time = corners.time[:, None, None]
+        by_view += [-by_point @ turn * time, by_point * time]
+    rows = np.concatenate([by_shared, *by_view, residual[..., None]], axis=-1)
     rows *= np.sqrt(weights)[:, None, None]
     rows[weights == 0] = 0.0  # where the lens model ends they are NaN
     n = int(free.sum())
-    blocks = np.stack([(part := rows[s].reshape(-1, n + POSE + 1)).T @ part for s in corners.slices])
-    p = slice(n, n + POSE)
-    precision = prior.precision(bundle.camera)[free]
-    sides = blocks[:, :n, -1], blocks[:, p, -1]
+    own = rows.shape[-1] - n - 1
+    blocks = np.stack([(part := rows[s].reshape(-1, n + own + 1)).T @ part for s in corners.slices])
+    p = slice(n, n + own)
+    pose, pose_side = blocks[:, p, p], blocks[:, p, -1]
+    if corners.time is not None:
+        drift = prior.drift_precision
+        pose[:, POSE:, POSE:] += np.diag(drift)
+        pose_side[:, POSE:] -= drift * bundle.drift
+    precision = prior.precision(bundle)[free]
     return NormalEquations(
-        blocks[:, :n, :n], blocks[:, :n, p], blocks[:, p, p], *sides, precision, -precision * prior.pull(bundle.camera)[free]
+        blocks[:, :n, :n], blocks[:, :n, p], pose, blocks[:, :n, -1], pose_side, precision, -precision * prior.pull(bundle)[free]
     )
 
 
 def reduced(equations: NormalEquations, damping: float = 0.0) -> tuple[Array, Array, Array, Array]:
-    """Eliminate the poses. Returns camera matrices (V, P, P), right sides (V, P), and the poses' answers (V, 6, P), (V, 6).
+    """Eliminate the poses. Returns shared matrices (V, S, S), right sides (V, S), and the poses' answers (V, K, S), (V, K).
 
-    Their sums over the views, with the prior, are the camera's system; a view's pose step is `answer - by_camera @ camera_step`.
+    Their sums over the views, with the prior, are the shared system; a view's pose step is `answer - by_shared @ shared_step`.
     """
     diagonal = np.einsum("vii->vi", equations.pose)
-    pose = equations.pose + (damping * diagonal)[:, :, None] * np.eye(POSE)
+    unit = np.eye(diagonal.shape[1])
+    pose = equations.pose + (damping * diagonal)[:, :, None] * unit
     both = np.concatenate([np.swapaxes(equations.mixed, 1, 2), equations.pose_side[..., None]], axis=-1)
     # units differ (radians, mm), so the system is solved with a unit diagonal
     scale = 1 / np.sqrt(np.maximum(diagonal, 1e-300))[..., None]
-    system = pose * scale * np.swapaxes(scale, 1, 2) + LEAST_DAMPING * np.eye(POSE)  # a view without weight stays where it is
+    system = pose * scale * np.swapaxes(scale, 1, 2) + LEAST_DAMPING * unit  # a view without weight stays where it is
     answer = scale * np.linalg.solve(system, scale * both)
-    by_camera, plain = answer[..., :-1], answer[..., -1]
-    matrix = equations.camera - equations.mixed @ by_camera
-    side = equations.camera_side - np.einsum("vpk,vk->vp", equations.mixed, plain)
-    return matrix, side, by_camera, plain
+    by_shared, plain = answer[..., :-1], answer[..., -1]
+    matrix = equations.shared - equations.mixed @ by_shared
+    side = equations.shared_side - np.einsum("vpk,vk->vp", equations.mixed, plain)
+    return matrix, side, by_shared, plain
 
 
 def adjust(start: Bundle, corners: BoardCorners, free: Mask, prior: Prior, weights: Array | None = None, robust: bool = False) -> Bundle:
     """Fit a bundle to corners by Levenberg-Marquardt.
 
-    free (P,): camera parameters to estimate; poses always are. weights (M,): of the corners, 1 by default. robust: weigh by
+    free (P + F,): shared parameters to estimate; poses always are. weights (M,): of the corners, 1 by default. robust: weigh by
     Cauchy's function of the residual in units of the overall scale instead, again at every step.
     Returns the best bundle reached; `step_in_sigmas` tells whether that is the minimum.
     """
@@ -171,7 +234,7 @@ def adjust(start: Bundle, corners: BoardCorners, free: Mask, prior: Prior, weigh
     residuals = bundle.residuals(corners)
     for _ in range(MOST_STEPS):
         weight = _cauchy(residuals) if robust else fixed
-        cost = _cost(residuals, weight) + prior.cost(bundle.camera)
+        cost = _cost(residuals, weight) + prior.cost(bundle)
         if not np.isfinite(cost):
             break
         equations = normal_equations(bundle, corners, free, weight, prior)
@@ -183,7 +246,7 @@ def adjust(start: Bundle, corners: BoardCorners, free: Mask, prior: Prior, weigh
                 return bundle
             trial = _try_move(bundle, free, step) if gain < np.inf else bundle
             moved = trial.residuals(corners)
-            accepted = _cost(moved, weight) + prior.cost(trial.camera) < cost
+            accepted = _cost(moved, weight) + prior.cost(trial) < cost
             damping = max(damping / 10, LEAST_DAMPING) if accepted else damping * 10
         if not accepted:
             return bundle
@@ -192,19 +255,19 @@ def adjust(start: Bundle, corners: BoardCorners, free: Mask, prior: Prior, weigh
 
 
 def _step(equations: NormalEquations, damping: float) -> tuple[tuple[Array, Array], float]:
-    """The damped step of camera and poses, and by how much it should lower the sum of squares (inf if there is no step)."""
-    count = equations.camera.shape[-1]
+    """The damped step of shared parameters and poses, and by how much it should lower the sum of squares (inf if there is no step)."""
+    count = equations.shared.shape[-1]
     try:
-        matrix, side, by_camera, plain = reduced(equations, damping)
-        diagonal = np.einsum("vii->i", equations.camera) + equations.prior
+        matrix, side, by_shared, plain = reduced(equations, damping)
+        diagonal = np.einsum("vii->i", equations.shared) + equations.prior
         system = matrix.sum(axis=0) + np.diag(damping * diagonal + equations.prior)
         scale = 1 / np.sqrt(np.maximum(diagonal, 1e-300))
-        camera = scale * np.linalg.solve(system * np.outer(scale, scale), scale * (side.sum(axis=0) + equations.prior_side))
+        shared = scale * np.linalg.solve(system * np.outer(scale, scale), scale * (side.sum(axis=0) + equations.prior_side))
     except np.linalg.LinAlgError:
-        return (np.zeros(count), np.zeros((len(equations.pose), POSE))), np.inf
-    poses = plain - by_camera @ camera
-    gain = float((equations.camera_side.sum(axis=0) + equations.prior_side) @ camera + (equations.pose_side * poses).sum())
-    return (camera, poses), gain if np.isfinite(gain) else np.inf
+        return (np.zeros(count), np.zeros_like(equations.pose_side)), np.inf
+    poses = plain - by_shared @ shared
+    gain = float((equations.shared_side.sum(axis=0) + equations.prior_side) @ shared + (equations.pose_side * poses).sum())
+    return (shared, poses), gain if np.isfinite(gain) else np.inf
 
 
 def _try_move(bundle: Bundle, free: Mask, step: tuple[Array, Array]) -> Bundle:

@@ -1,9 +1,10 @@
 """A camera from photographs of a flat board: Zhang's method (the paper's 4.1), with the covariance of its parameters.
 
 A start without distortion is searched over focal lengths; a robust bundle adjustment brings it near; views and corners that
-do not fit are then left out by name, and least squares over the rest gives the answer. The covariance has the poses
-marginalised out and is enlarged where residuals are correlated within a view: a bent board or a moved camera shifts
-neighbouring corners together, so that more corners do not help as much as plain least squares believes.
+do not fit are then left out or weighed down by name, and least squares over the rest gives the answer, with the bends of the board.
+The covariance has poses and bends marginalised out and is enlarged where residuals are correlated within a view: a board bent
+by hand or a moved camera shifts neighbouring corners together, so that more corners do not help as much as plain least
+squares believes.
 """
 
 from __future__ import annotations
@@ -15,9 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.camera import bundle as ba
-from dishmap.camera.bundle import BoardCorners, Bundle, Prior
-from dishmap.camera.chessboard import BoardView
+from dishmap.camera.board import BENDS, BoardShape, BoardView
+from dishmap.camera.bundle import BoardCorners, Bundle
 from dishmap.camera.model import Camera
+from dishmap.camera.problem import Problem, problem_of
+from dishmap.camera.screening import CHECK_INPUT, FEWEST_VIEWS, corner_weights, outlier_names, screened
 from dishmap.errors import FitError, InputError, MeasurementError
 from dishmap.transforms import Pose, angle_between_rad
 
@@ -31,16 +34,11 @@ LENSES = {
     "opencv12": ("opencv", 12),
     "fisheye": ("fisheye", 4),
 }
-FEWEST_VIEWS, FEWEST_CORNERS = 3, 12
+FEWEST_CORNERS = 12
 # A planar start needs a board that is flat to this part of its size.
 FLATNESS = 0.1
 # Focal lengths tried for the start, in units of the longer side: from 120 degrees across to a long lens.
 START_FOCAL = {"opencv": np.geomspace(0.3, 20.0, 11), "fisheye": np.geomspace(0.2, 3.0, 8)}
-# A view is left out when its rms is this many times the median view's, or when so many of its corners are outliers.
-BAD_VIEW_RATIO, BAD_VIEW_OUTLIERS = 4.0, 0.25
-# A corner is an outlier beyond this many robust sigmas of its own view: Gaussian noise gets there once in 6e7 corners.
-OUTLIER_SIGMAS = 6.0
-MOST_ROUNDS = 20
 # Views must show the board in directions that differ by this much, or focal length and distance cannot be told apart.
 SMALLEST_TURN_RAD = np.radians(3.0)
 WEAK_TURN_RAD = np.radians(15.0)
@@ -49,7 +47,6 @@ WEAK_TURN_RAD = np.radians(15.0)
 LARGEST_SIGMA, LEAST_NOISE_PX = 0.02, 0.05
 # A camera that misses by more than this part of the picture's side is none: corners and board do not belong together.
 LARGEST_SIGMA_OF_SIDE = 0.005
-CHECK_INPUT = "are corners and board in the same order, and all photographs by one camera with fixed focus and zoom?"
 # Convergence: a remaining step under a tenth of the smallest error that could matter.
 LARGEST_STEP_SIGMAS = 0.1
 WEAK_VIEWS, WEAK_COVERAGE = 8, 0.4
@@ -60,11 +57,13 @@ COVERAGE_CELLS = 8
 class Calibration:
     """A calibrated camera, and what it was made from.
 
-    camera: with covariance. views: those used, with all their corners; poses: camera_from_board of each; used: which corners
-    of each view took part (N,); residuals_px: measured minus projected (N, 2) of each view; view_rms_px (V,) and rms_px: root mean
-    square of the 2D residual over used corners, as OpenCV's. sigma_px: noise of one coordinate. inflation: factor by which
-    sigmas were enlarged, on average, for correlation within views. coverage: part of the picture where corners were seen.
-    rejected: name and reason of views left out. notes: sentences on what makes this calibration weak.
+    camera: with covariance; lens: one of LENSES. views: those used, with all their corners; poses: camera_from_board of each;
+    used: which corners of each view took part (N,); view_weight (V,): 1, or less where a view is noisier than the others;
+    residuals_px: measured minus projected (N, 2) of each view; view_rms_px (V,) and rms_px: root mean square of the 2D residual over
+    used corners, as OpenCV's. sigma_px: noise of one coordinate. inflation: factor by which sigmas were enlarged, on
+    average, for correlation within views. coverage: part of the picture where corners were seen. rejected: name and reason of
+    views left out. notes: sentences on what makes this calibration weak. board: how the board is bent. expected (P,): what the
+    prior on the camera is about.
     """
 
     camera: Camera
@@ -79,35 +78,60 @@ class Calibration:
     coverage: float
     rejected: dict[str, str]
     notes: tuple[str, ...]
+    lens: str
+    view_weight: Array
+    board: BoardShape
+    expected: Array
 
     @property
     def view_names(self) -> tuple[str, ...]:
         """Names of the views that were used."""
         return tuple(view.name for view in self.views)
 
+    @property
+    def outliers(self) -> dict[str, list[str]]:
+        """Corners that were left out, in words, of each view that has any."""
+        rows = zip(self.views, self.used, self.residuals_px, strict=True)
+        return {view.name: outlier_names(view, used, residual) for view, used, residual in rows if not used.all()}
 
-def calibrate(views: Sequence[BoardView], width_px: int, height_px: int, lens: str = "opencv5") -> Calibration:
-    """Calibrate a camera from views of a flat board.
+    @property
+    def problem(self) -> Problem:
+        """The least-squares problem that this calibration solves."""
+        return Problem(self.views, self.board.middle_mm, self.board.half_mm, self.expected, not self.board.free)
+
+    @property
+    def bundle(self) -> Bundle:
+        """Its solution."""
+        rotation, translation = np.stack([p.rotation for p in self.poses]), np.stack([p.translation_mm for p in self.poses])
+        return Bundle(replace(self.camera, covariance=None), rotation, translation, self.board.bend_mm)
+
+    @property
+    def weights(self) -> Array:
+        """Weight of each corner of all views (M,)."""
+        return corner_weights(self.used, self.view_weight)
+
+
+def calibrate(views: Sequence[BoardView], width_px: int, height_px: int, lens: str = "opencv5", flat: bool = False) -> Calibration:
+    """Calibrate a camera from views of a board.
 
     views: corners and where they are printed, at least 3 views in different directions. width_px, height_px: size of the
-    photographs. lens: one of LENSES (`opencv5` has k1, k2, p1, p2, k3).
-    Raises InputError for impossible input; MeasurementError (or FitError) when the views do not determine a camera.
+    photographs. lens: one of LENSES (`opencv5` has k1, k2, p1, p2, k3). flat: the board is flat (glass), its bends are zero;
+    otherwise they are learnt. Raises InputError for impossible input; MeasurementError (or FitError) when the views do not determine a
+    camera.
     """
     if lens not in LENSES:
         raise InputError(f"unknown lens {lens!r}; use one of {', '.join(LENSES)}")
     model, count = LENSES[lens]
     camera = Camera(width_px, height_px, np.full(2, float(width_px)), np.array([width_px - 1, height_px - 1]) / 2, np.zeros(count), model)
     _check_views(views, camera)
-    corners = _joined(views)
-    bundle = _start(camera, corners)
-    expected = bundle.camera.parameters
-    free = np.zeros(len(camera.parameters), dtype=bool)
-    free[[0, 1, 4, 5]] = True  # first what bends most: focal lengths and two radial terms
-    bundle = ba.adjust(bundle, corners, free, _prior(expected, bundle, corners), robust=True)
-    free[:] = True
-    bundle = ba.adjust(bundle, corners, free, _prior(expected, bundle, corners), robust=True)
-    bundle, kept, used, rejected = _without_outliers(bundle, list(views), expected)
-    return _result(bundle, kept, used, rejected, expected)
+    problem = problem_of(views, camera.parameters, flat)
+    bundle = _start(camera, problem.joined())
+    problem = replace(problem, expected=bundle.camera.parameters)
+    first = np.zeros(len(bundle.shared), dtype=bool)
+    first[[0, 1, 4, 5]] = True  # first what bends most: focal lengths and two radial terms
+    for free in (first, problem.free(bundle)):
+        bundle = problem.solve(bundle, free=free, robust=True)
+    return _result(*screened(problem, bundle), lens)
 
 
 def _check_views(views: Sequence[BoardView], camera: Camera) -> None:
@@ -129,11 +153,6 @@ def _check_views(views: Sequence[BoardView], camera: Camera) -> None:
             raise InputError(f"the corners of view {view.name} are not spread over a flat board in x and y (z = 0)")
 
 
-def _joined(views: Sequence[BoardView]) -> BoardCorners:
-    bounds = np.cumsum([0, *(len(view.pixels) for view in views)])
-    return BoardCorners(np.concatenate([v.pixels for v in views]), np.concatenate([v.board_mm for v in views]), bounds)
-
-
 def _start(camera: Camera, corners: BoardCorners) -> Bundle:
     """The focal length, of a list, with which planar poses fit the typical corner best, and these poses."""
     best: tuple[float, Bundle] | None = None
@@ -143,7 +162,7 @@ def _start(camera: Camera, corners: BoardCorners) -> Bundle:
         rays = trial.unproject(corners.pixels)
         if not np.isfinite(rays).all():
             continue
-        bundle = Bundle(trial, *_planar_poses(rays, corners))
+        bundle = Bundle(trial, *_planar_poses(rays, corners), np.zeros(len(BENDS)), np.zeros((len(corners.slices), ba.DRIFT)))
         length = np.linalg.norm(bundle.residuals(corners), axis=1)
         score = float(np.median(np.where(np.isfinite(length), length, np.inf)))
         if best is None or score < best[0]:
@@ -152,12 +171,6 @@ def _start(camera: Camera, corners: BoardCorners) -> Bundle:
         raise FitError("no focal length fits the views; do corners and board belong together, row by row?")
     # where single poses put corners behind the camera there is nothing to adjust from
     return best[1]
-
-
-def _prior(expected: Array, bundle: Bundle, corners: BoardCorners) -> Prior:
-    camera = bundle.camera
-    radius = float((np.linalg.norm(corners.pixels - camera.principal_px, axis=1) / camera.focal_px.min()).max())
-    return Prior(expected, radius, ba.scale_px(bundle.residuals(corners)))
 
 
 def _planar_poses(rays: Array, corners: BoardCorners) -> tuple[Array, Array]:
@@ -184,85 +197,43 @@ def _planar_poses(rays: Array, corners: BoardCorners) -> tuple[Array, Array]:
     return rotation, size[:, None] * third / scale - np.einsum("vij,vj->vi", rotation, middle)
 
 
-def _without_outliers(
-    bundle: Bundle, views: list[BoardView], expected: Array
-) -> tuple[Bundle, list[BoardView], list[NDArray[np.bool_]], dict[str, str]]:
-    """Least squares over what fits: views and corners that do not are left out, until the choice no longer changes."""
-    rejected: dict[str, str] = {}
-    free = np.ones(len(bundle.camera.parameters), dtype=bool)
-    used: list[NDArray[np.bool_]] = []
-    for _ in range(MOST_ROUNDS):
-        residuals = bundle.residuals(_joined(views))
-        parts = [residuals[s] for s in _joined(views).slices]
-        bad = _bad_views([view.name for view in views], parts)
-        keep = [view.name not in bad for view in views]
-        rejected |= bad
-        if sum(keep) < FEWEST_VIEWS:
-            name, reason = next(iter(rejected.items()))
-            raise MeasurementError(f"fewer than {FEWEST_VIEWS} of the views fit together (first left out: {name}, {reason}); {CHECK_INPUT}")
-        before, used = used, [_inliers(part) for part, k in zip(parts, keep, strict=True) if k]
-        views = [view for view, k in zip(views, keep, strict=True) if k]
-        if not bad and len(before) == len(used) and all((a == b).all() for a, b in zip(before, used, strict=True)):
-            break
-        bundle = Bundle(bundle.camera, bundle.rotation[keep], bundle.translation_mm[keep])
-        corners = _joined(views)
-        bundle = ba.adjust(bundle, corners, free, _prior(expected, bundle, corners), np.concatenate(used).astype(float))
-    # the prior is only as weak as the noise is small, and the noise is known now
-    bundle = ba.adjust(bundle, corners, free, _prior(expected, bundle, corners), np.concatenate(used).astype(float))
-    return bundle, views, used, rejected
-
-
-def _bad_views(names: Sequence[str], parts: Sequence[Array]) -> dict[str, str]:
-    """Views that do not fit, with the reason, worst first; only the worst of them, as it spoils the others."""
-    scales = np.array([ba.scale_px(part) for part in parts])
-    outliers = np.array([1 - _inliers(part).mean() for part in parts])
-    worst = int(np.argmax(scales))
-    if scales[worst] > BAD_VIEW_RATIO * np.median(scales) or np.isinf(scales[worst]):
-        size = f"{scales[worst]:.2g} px" if np.isfinite(scales[worst]) else "beyond all bounds"
-        return {names[worst]: f"its residuals ({size}) are over {BAD_VIEW_RATIO:g} times those of the typical view"}
-    worst = int(np.argmax(outliers))
-    if outliers[worst] > BAD_VIEW_OUTLIERS:
-        return {names[worst]: f"{outliers[worst]:.0%} of its corners are outliers"}
-    return {}
-
-
-def _inliers(residuals: Array) -> NDArray[np.bool_]:
-    length = np.linalg.norm(residuals, axis=1)
-    return np.asarray(np.isfinite(length) & (length <= OUTLIER_SIGMAS * ba.scale_px(residuals)))
-
-
 def _result(
-    bundle: Bundle, views: list[BoardView], used: list[NDArray[np.bool_]], rejected: dict[str, str], expected: Array
+    problem: Problem, bundle: Bundle, used: tuple[NDArray[np.bool_], ...], weight: Array, rejected: dict[str, str], lens: str
 ) -> Calibration:
-    corners, weights = _joined(views), np.concatenate(used).astype(float)
-    free = np.ones(len(bundle.camera.parameters), dtype=bool)
+    corners, weights, free = problem.corners(bundle), corner_weights(used, weight), problem.free(bundle)
     residuals = bundle.residuals(corners)
     square = (residuals**2).sum(axis=1)
-    degrees_of_freedom = 2 * weights.sum() - free.sum() - ba.POSE * len(views)
-    sigma = float(np.sqrt(square[weights > 0].sum() / degrees_of_freedom))
+    good = weights > 0
+    degrees_of_freedom = 2 * good.sum() - free.sum() - ba.POSE * len(problem.views)
+    sigma = float(np.sqrt((weights * square)[good].sum() / degrees_of_freedom))
     if sigma > LARGEST_SIGMA_OF_SIDE * max(bundle.camera.width_px, bundle.camera.height_px):
         raise MeasurementError(f"the best camera misses the corners by {sigma:.3g} px; {CHECK_INPUT}")
-    equations = ba.normal_equations(bundle, corners, free, weights, _prior(expected, bundle, corners))
+    equations = ba.normal_equations(bundle, corners, free, weights, problem.prior(bundle, corners, weights))
     _check_turn(bundle)
-    covariance, inflation = _covariance(bundle.camera, equations, sigma)
+    covariance, inflation = shared_covariance(bundle.camera, equations, sigma)
     if ba.step_in_sigmas(equations, max(sigma, LEAST_NOISE_PX)) > LARGEST_STEP_SIGMAS:
         raise FitError("the calibration did not reach its best fit; use more views, or a lens with fewer coefficients")
     parts = [residuals[s] for s in corners.slices]
-    view_rms = np.array([np.sqrt((part[u] ** 2).sum(axis=1).mean()) for part, u in zip(parts, used, strict=True)])
-    coverage = _coverage(bundle.camera, corners.pixels[weights > 0])
+    coverage = _coverage(bundle.camera, corners.pixels[good])
+    count = len(bundle.camera.parameters)
+    bends = np.zeros((len(BENDS), len(BENDS))) if problem.flat else covariance[count:, count:]
     return Calibration(
-        camera=replace(bundle.camera, covariance=covariance),
-        views=tuple(views),
+        camera=replace(bundle.camera, covariance=covariance[:count, :count]),
+        views=problem.views,
         poses=tuple(Pose(r, t) for r, t in zip(bundle.rotation, bundle.translation_mm, strict=True)),
-        used=tuple(used),
+        used=used,
         residuals_px=tuple(parts),
-        view_rms_px=view_rms,
-        rms_px=float(np.sqrt(square[weights > 0].mean())),
+        view_rms_px=np.array([np.sqrt((part[u] ** 2).sum(axis=1).mean()) for part, u in zip(parts, used, strict=True)]),
+        rms_px=float(np.sqrt(square[good].mean())),
         sigma_px=sigma,
         inflation=inflation,
         coverage=coverage,
         rejected=rejected,
         notes=_notes(bundle, coverage),
+        lens=lens,
+        view_weight=weight,
+        board=BoardShape(problem.middle_mm, problem.half_mm, bundle.bend_mm, bends, not problem.flat),
+        expected=problem.expected,
     )
 
 
@@ -281,8 +252,8 @@ def _check_turn(bundle: Bundle) -> None:
         )
 
 
-def _covariance(camera: Camera, equations: ba.NormalEquations, sigma_px: float) -> tuple[Array, float]:
-    """Covariance of the camera parameters with the poses marginalised out, and the mean factor of its sigmas for clustering.
+def shared_covariance(camera: Camera, equations: ba.NormalEquations, sigma_px: float) -> tuple[Array, float]:
+    """Covariance of camera parameters and bends with the poses marginalised out, and the mean factor of its sigmas for clustering.
 
     In coordinates where independent noise gives the unit matrix, each view adds the outer product of its score, adjusted for
     its leverage (CR2 of Bell and McCaffrey 2002: unbiased if corners are independent). With 10 to 20 views the sum is noisy, so it is

@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dishmap.camera.board import BoardSearch, BoardView
 from dishmap.errors import ImageError, InputError, MeasurementError
 
 Array = NDArray[np.float64]
@@ -40,34 +40,6 @@ BLUR_RANGE_PX = (0.3, 5.0)
 LARGEST_MISFIT = 0.25
 FEWEST_FITTED = 0.8
 LARGEST_LOST_SIDE = 0.5
-
-
-@dataclass(frozen=True)
-class BoardView:
-    """Corners of one photograph of a board: pixels (N, 2) and where they are printed, board_mm (N, 3), in the board's frame."""
-
-    name: str
-    pixels: Array
-    board_mm: Array
-
-    def __post_init__(self) -> None:
-        pixels, board = np.asarray(self.pixels, dtype=float), np.asarray(self.board_mm, dtype=float)
-        if pixels.ndim != 2 or pixels.shape[1:] != (2,) or board.shape != (len(pixels), 3):
-            raise InputError(f"view {self.name} needs pixels (N, 2) and board_mm (N, 3), not {pixels.shape} and {board.shape}")
-        if not (np.isfinite(pixels).all() and np.isfinite(board).all()):
-            raise InputError(f"view {self.name} holds NaN or infinity; leave out corners that were not found")
-        object.__setattr__(self, "pixels", pixels)
-        object.__setattr__(self, "board_mm", board)
-
-
-@dataclass(frozen=True)
-class BoardSearch:
-    """What `find_boards` found: views, image size, and for each photograph without a board its name and the reason."""
-
-    views: tuple[BoardView, ...]
-    width_px: int
-    height_px: int
-    rejected: dict[str, str]
 
 
 def chessboard_mm(corners: tuple[int, int], square_mm: float) -> Array:

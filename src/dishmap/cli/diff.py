@@ -217,15 +217,19 @@ def measure_reference(setup: Setup, before: tuple[Path, ...], bar: Bar) -> Refer
     frames: list[State] = []
     digests = []
     for path in before:
-        if is_measurement(path):
-            saved = read_measurement(path, setup.camera, setup.pattern)
+        saved = read_measurement(path, setup.camera, setup.pattern) if is_measurement(path) else None
+        digest = sha256_of(path) if saved is None else saved.photograph_sha256
+        if digest and digest in digests:
+            raise InputError(
+                f"{path} is another measurement of a photograph that is there already, whose noise would count twice; leave it out"
+            )
+        digests.append(digest)
+        if saved is not None:
             frames.append(State(saved.poses))
-            digests.append(saved.photograph_sha256)
             bar.step()(1, 1)
             continue
         hint = later_hint(setup.hint, frames[0]) if frames else setup.hint
         frames.append(measure(setup, path, hint, bar))
-        digests.append(sha256_of(path))
     return Reference(combine_states(frames), before, tuple(digests))
 
 
@@ -246,6 +250,9 @@ def compare(setup: Setup, reference: Reference, job: Job, bar: Bar) -> tuple[Dif
     from dishmap.io.results import sha256_of
 
     begin = time.perf_counter()
+    shared = [path for path in job.photographs if sha256_of(path) in reference.digests]
+    if shared and not len(reference.files) == len(job.photographs) == 1:
+        raise InputError(f"{shared[0]} is also a photograph of the reference, and an average with it would hide a change; leave it out")
     hint = later_hint(setup.hint, reference.state)
     current = combine_states([measure(setup, path, hint, bar) for path in job.photographs])
     measured = time.perf_counter()
@@ -253,10 +260,8 @@ def compare(setup: Setup, reference: Reference, job: Job, bar: Bar) -> tuple[Dif
         result = compare_states(
             reference.state, current, setup.camera, setup.pattern, setup.priors, setup.method, setup.surface, bar.step()
         )
-    one_each = len(reference.files) == len(job.photographs) == 1
-    same = one_each and (result.same or sha256_of(job.photographs[0]) in reference.digests)
     seconds = {"measure": measured - begin, "compare": time.perf_counter() - measured}
-    return replace(result, same=same), seconds
+    return replace(result, same=result.same or bool(shared)), seconds
 
 
 def leave(setup: Setup, reference: Reference, job: Job, result: Difference, seconds: dict[str, float], alone: bool) -> dict[str, Any]:

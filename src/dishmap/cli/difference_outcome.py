@@ -36,6 +36,7 @@ def outcome_files(result: Difference, title: str, provenance: DifferenceProvenan
 
 def print_difference(result: Difference, title: str, folder: Path) -> None:
     """Print what changed and how sure that is."""
+    from dishmap.compare import PAPER
     from dishmap.difference_verdict import difference_verdict
 
     say(f"{title}: {len(result.table)} of {len(result.pattern)} targets compared")
@@ -46,7 +47,7 @@ def print_difference(result: Difference, title: str, folder: Path) -> None:
         say(_methods(result))
     _print_left_out(result)
     for name, why in result.surface_problems.items():
-        say(f"  no surface through the {name}: {why}")
+        say(f"  the paper's method failed: {why}" if name == PAPER else f"  no surface through the {name}: {why}")
     say(f"report: {folder / REPORT}")
 
 
@@ -59,8 +60,9 @@ def brief(result: Difference) -> str:
 
 
 def _print_joint(result: Difference, joint: DifferenceMap) -> None:
-    from dishmap.compare import JOINT, figures_of
-    from dishmap.difference_verdict import rigid_of
+    from dishmap.compare import JOINT
+    from dishmap.difference_verdict import rigid_of, with_sigma
+    from dishmap.figures import figures_of
 
     numbers = figures_of(result.tables[JOINT])
     say(
@@ -72,6 +74,8 @@ def _print_joint(result: Difference, joint: DifferenceMap) -> None:
     move, turn = _axes(rigid.move_mm, rigid.sigma_move_mm), _axes(rigid.turn_deg, rigid.sigma_turn_deg)
     say(f"  rigid motion in the dish frame: {move} mm; turn {turn} deg")
     say(f"  {_expansion(result, joint)}")
+    if joint.priors.focal_drift > 0:
+        say(f"  focal length: changed by {with_sigma(PPM * joint.focal_drift[0], PPM * joint.focal_drift[1], ' ppm')}")
     for line in _hypotheses(joint):
         say(line)
     if joint.noise_factor > 1:
@@ -82,8 +86,8 @@ def _print_joint(result: Difference, joint: DifferenceMap) -> None:
 
 def _expansion(result: Difference, joint: DifferenceMap) -> str:
     """What was assumed of expansion, and what a wrong assumption would do."""
-    from dishmap.compare import distance_mm
     from dishmap.difference_verdict import scale_open, with_sigma
+    from dishmap.figures import distance_mm
 
     each = f"each {EXAMPLE_PPM:g} ppm would be {distance_mm(result) * EXAMPLE_PPM / PPM:.2g} mm of distance"
     cannot = f"one camera cannot tell expansion from distance: {each}"
@@ -109,7 +113,8 @@ def _hypotheses(joint: DifferenceMap) -> list[str]:
 
 def _methods(result: Difference) -> str:
     """A table of the methods side by side, and how far they are apart."""
-    from dishmap.compare import JOINT, PAPER, apart, figures_of
+    from dishmap.compare import JOINT, PAPER
+    from dishmap.figures import apart, figures_of
 
     columns = [("displacement rms mm", "displacement_rms_mm"), ("depth rms mm", "depth_change_rms_mm"), ("shape rms mm", "shape_rms_mm")]
     rows = []

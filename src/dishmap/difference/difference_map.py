@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
+from threadpoolctl import threadpool_limits
 
 from dishmap.camera.model import Camera
 from dishmap.difference.changes import TargetChanges, target_changes
@@ -125,9 +126,11 @@ def joint_difference(
     Raises MeasurementError when fewer than three targets are common, InputError for a rigid target that the pattern does not have.
     """
     priors = priors or Priors()
-    changes = target_changes(reference, current, camera, pattern)
-    estimate = joint_estimate(changes, pattern, camera, reference.camera_from_dish, priors, progress)
-    return _assembled(changes, estimate, pattern, reference, current, priors)
+    # matrices are small: threads would cost more than they bring, far more on a busy machine
+    with threadpool_limits(limits=1, user_api="blas"):
+        changes = target_changes(reference, current, camera, pattern)
+        estimate = joint_estimate(changes, pattern, camera, reference.camera_from_dish, priors, progress)
+        return _assembled(changes, estimate, pattern, reference, current, priors)
 
 
 class _Frame:

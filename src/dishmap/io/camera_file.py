@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dishmap.camera.board import BoardView
 from dishmap.camera.calibrate import Calibration
-from dishmap.camera.chessboard import BoardView
 from dishmap.camera.model import Camera
 from dishmap.errors import CameraError, InputError
 from dishmap.io.atomic import write_text

@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from dishmap.compare import DISPLACEMENT, JOINT, PAPER, SHAPE, Difference, apart, distance_mm, figures_of
+from dishmap.compare import DISPLACEMENT, JOINT, PAPER, SHAPE, Difference
 from dishmap.difference.difference_map import DifferenceMap
 from dishmap.difference.paper import PaperDifference
+from dishmap.figures import apart, distance_mm, figures_of
 from dishmap.io.atomic import write_files
 from dishmap.io.difference_file import format_difference, format_difference_ply
 from dishmap.io.pose_file import pose_content
@@ -102,6 +103,7 @@ def difference_summary(result: Difference, provenance: DifferenceProvenance) -> 
         "joint": None if result.joint is None else _joint(result, result.joint),
         "paper": None if result.paper is None else _paper(result, result.paper),
         "apart": asdict(apart(result.tables[JOINT], result.tables[PAPER])) if len(result.tables) == 2 else None,
+        "problems": dict(result.surface_problems),
         "seconds": {name: round(value, 3) for name, value in provenance.seconds.items()},
     }
     return json_text(content)

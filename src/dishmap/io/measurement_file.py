@@ -137,12 +137,11 @@ def parse_measurement(data: bytes, camera: Camera, pattern: Pattern, source: str
         arrays = _arrays(data)
         header = json.loads(bytes(arrays.pop(HEADER).astype(np.uint8)).decode())
         found = header["format"]
-        strange = found if isinstance(found, str) and found != FORMAT else ""
         digests = {name: str(header[f"{name}_sha256"]) for name in ("camera", "pattern", "photograph")}
     except (zipfile.BadZipFile, OSError, ValueError, KeyError, TypeError, EOFError, RecursionError, NotImplementedError) as error:
         raise InputError(f"{source} is no whole measurement of dishmap; make it again with `dishmap map`") from error
-    if strange:
-        raise InputError(f"{source} has the format {strange[:40]!r}, and {FORMAT!r} is read; make it again with `dishmap map`")
+    if found != FORMAT:
+        raise InputError(f"{source} has the format {str(found)[:40]!r}, and {FORMAT!r} is read; make it again with `dishmap map`")
     _check_made_with(digests, camera, pattern, source)
     try:
         return Measurement(_poses(header, arrays, camera, pattern), digests["photograph"])

@@ -11,10 +11,12 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 from scipy.stats import chi
 
+from dishmap.difference_verdict import ROUNDING, TOLD_SIGMAS
 from dishmap.plot.canvas import BLUE, DIVERGING, FAINT, INK, ORANGE, RED, SEQUENTIAL, Array, as_svg, new_figure
 
 Bools = NDArray[np.bool_]
@@ -26,8 +28,6 @@ LEVELS = 20
 MARGIN = 0.08
 # The scale of a change reaches at least so many sigmas, so that noise never looks like a strong change.
 LEAST_SIGMAS = 3.0
-# A value this many sigmas from zero or more is told from none (95 %).
-TOLD_SIGMAS = 1.96
 # Names beside points stay readable up to so many.
 MOST_NAMES = 12
 # Beyond so many pairs lines between targets hide each other, and dots at their middles are drawn.
@@ -54,16 +54,16 @@ def change_map(xy_mm: Array, change_mm: Array, sigma_mm: Array, aside: Bools, id
     _fill(axes, xy_mm[used], change_mm[used], norm, DIVERGING)
     told = ~(np.abs(change_mm) < TOLD_SIGMAS * sigma_mm)
     for some, size, edge, words in (
-        (used & told, 30, INK, "told from zero"),
+        (used & told, 30, INK, f"beyond {TOLD_SIGMAS:g} sigma"),
         (used & ~told, 13, FAINT, f"within {TOLD_SIGMAS:g} sigma of zero"),
     ):
         if some.any():
-            axes.scatter(
-                *xy_mm[some].T, c=change_mm[some], cmap=DIVERGING, norm=norm, s=size, edgecolors=edge, linewidths=0.7, zorder=3, label=words
-            )
+            x, y = xy_mm[some].T
+            colors: dict[str, Any] = {"c": change_mm[some], "cmap": DIVERGING, "norm": norm, "edgecolors": edge}
+            axes.scatter(x, y, s=size, linewidths=0.7, zorder=3, label=words, **colors)
     _crosses(axes, xy_mm, aside, ids)
     if np.isfinite(sigma_mm).any() or aside.any():
-        _legend(axes)
+        _legend(figure)
     figure.colorbar(_mappable(norm, DIVERGING), ax=axes, label=label)
     _dish_axes(axes, xy_mm)
     return figure
@@ -75,11 +75,11 @@ def misfit_map(xy_mm: Array, misfit: Array, aside: Bools, ids: Ints) -> Figure:
     figure, axes = _map_figure(xy_mm)
     used = ~aside
     norm = Normalize(0.0, max(LEAST_MISFIT_SHOWN, float(misfit[used].max(initial=0.0))))
-    style: dict[str, Any] = {"cmap": SEQUENTIAL, "norm": norm, "edgecolors": INK, "linewidths": 0.6, "zorder": 3}
-    axes.scatter(*xy_mm[used].T, c=misfit[used], s=60, label="used", **style)
+    x, y = xy_mm[used].T
+    axes.scatter(x, y, c=misfit[used], s=60, label="used", cmap=SEQUENTIAL, norm=norm, edgecolors=INK, linewidths=0.6, zorder=3)
     _crosses(axes, xy_mm, aside, ids)
     if aside.any():
-        _legend(axes)
+        _legend(figure)
     figure.colorbar(_mappable(norm, SEQUENTIAL), ax=axes, label="misfit (sigmas)")
     _dish_axes(axes, xy_mm)
     return figure
@@ -101,9 +101,9 @@ def ratio_map_chart(place_mm: Array, pair: Ints, ratio: Array, used: Bools) -> F
         lines.set_array(percent[used])
         axes.add_collection(lines)
     else:
-        middle = ends.mean(axis=1)
-        axes.scatter(*middle[used].T, c=percent[used], cmap=DIVERGING, norm=norm, s=9, zorder=2)
-    axes.scatter(*place_mm.T, s=10, color=INK, zorder=4)
+        x, y = ends[used].mean(axis=1).T
+        axes.scatter(x, y, c=percent[used], cmap=DIVERGING, norm=norm, s=9, zorder=2)
+    axes.scatter(place_mm[:, 0], place_mm[:, 1], s=10, color=INK, zorder=4)
     figure.colorbar(_mappable(norm, DIVERGING), ax=axes, label="ratio of distances - 1 (%)")
     _dish_axes(axes, place_mm)
     return figure
@@ -124,7 +124,7 @@ def misfit_histogram(misfit: Array, aside: Bools) -> Figure:
     expected = len(misfit) * MISFIT_REACH / MISFIT_BINS * root * chi.pdf(root * x, DIRECTIONS)
     axes.plot(x, expected, color=INK, label="noise alone, nothing fitted")
     axes.set(xlabel="misfit (sigmas)", ylabel="targets", xlim=(0.0, MISFIT_REACH))
-    axes.yaxis.get_major_locator().set_params(integer=True)
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderpad=0.0, ncols=3, columnspacing=1.2)
     return figure
 
@@ -135,7 +135,7 @@ def zernike_bars(names: Sequence[str], size_mm: Array, sigma_mm: Array) -> Figur
     figure, axes = new_figure(BARS_WIDTH_IN, BARS_AXIS_IN + BAR_IN * max(len(names), 3))
     place = np.arange(len(names))
     told = np.abs(size_mm) >= TOLD_SIGMAS * sigma_mm
-    for some, color, words in ((told, BLUE, "told from zero"), (~told, "#b8b8b8", f"within {TOLD_SIGMAS:g} sigma of zero")):
+    for some, color, words in ((told, BLUE, f"beyond {TOLD_SIGMAS:g} sigma"), (~told, "#b8b8b8", f"within {TOLD_SIGMAS:g} sigma of zero")):
         if some.any():
             axes.barh(place[some], size_mm[some], color=color, height=0.66, label=words)
     axes.errorbar(size_mm, place, xerr=sigma_mm, fmt="none", ecolor=INK, elinewidth=1.3, capsize=2.5, label="one sigma")
@@ -152,7 +152,8 @@ def _limit(change: Array, sigma: Array) -> float:
     """End of a scale that is symmetric about zero."""
     known = sigma[np.isfinite(sigma)]
     floor = LEAST_SIGMAS * float(np.median(known)) if known.size else 0.0
-    return max(float(np.abs(change).max(initial=0.0)), floor) or 1.0
+    limit = max(float(np.abs(change).max(initial=0.0)), floor)
+    return limit if limit > ROUNDING else 1.0
 
 
 def _mappable(norm: Normalize, colors: str) -> Any:
@@ -163,15 +164,17 @@ def _crosses(axes: Axes, xy_mm: Array, aside: Bools, ids: Ints) -> None:
     """Targets whose change was not used, with their ids when they are few."""
     if not aside.any():
         return
-    axes.scatter(*xy_mm[aside].T, marker="X", s=60, c=ORANGE, edgecolors=INK, linewidths=0.6, zorder=4, label="put aside")
+    x, y = xy_mm[aside].T
+    axes.scatter(x, y, marker="X", s=60, c=ORANGE, edgecolors=INK, linewidths=0.6, zorder=4, label="put aside")
     if aside.sum() <= MOST_NAMES:
         for (x, y), ident in zip(xy_mm[aside], ids[aside], strict=True):
             named = axes.annotate(str(ident), (x, y), xytext=(6, 6), textcoords="offset points", color=RED, fontsize=10, zorder=5)
             named.set_in_layout(False)
 
 
-def _legend(axes: Axes) -> None:
-    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderpad=0.0, ncols=3, columnspacing=1.0, handletextpad=0.3, fontsize=9.5)
+def _legend(figure: Figure) -> None:
+    # beside the axes a wide legend would make them smaller
+    figure.legend(loc="outside upper left", borderpad=0.2, ncols=3, columnspacing=1.0, handletextpad=0.3, fontsize=9.5)
 
 
 def _map_figure(xy_mm: Array) -> tuple[Figure, Axes]:

@@ -7,12 +7,14 @@ from html import escape
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from dishmap.plot.canvas import FAINT, INK, ORANGE, Array, round_length
 from dishmap.plot.photograph import BOX, Frame, frame_of, photograph_svg
 
-# The arrow of this quantile takes this part of the frame's larger side; longer ones are cut at so many times that.
-ARROW_QUANTILE, ARROW_PART, LONGEST_SHOWN = 0.95, 0.075, 1.6
+# The arrow of this quantile takes this part of the way to the next target, or of the frame's larger side where that is less; longer
+# ones are cut at so many times that.
+ARROW_QUANTILE, SPACING_PART, ARROW_PART, LONGEST_SHOWN = 0.95, 0.8, 0.075, 1.6
 # Yellow stands out from ink and ground alike once it has a dark edge, orange-red tells what is cut; both for the colour-blind too.
 PLAIN, CUT = "#f0e442", ORANGE
 WIDTH, CASING, HEAD = 3.4, 6.6, 11.0
@@ -25,27 +27,33 @@ LEGEND_HEIGHT = 70.0
 class Arrows:
     """Arrows of N targets, and how they are drawn.
 
-    from_px (N, 2): where targets were; move_px (N, 2); titles: what hovering tells; factor: by how much moves are enlarged.
+    from_px (N, 2): where targets were; move_px (N, 2); titles: what hovering tells; factor: by how much moves are enlarged; usual: length
+    in units of the frame that most arrows stay below.
     """
 
     from_px: Array
     move_px: Array
     titles: tuple[str, ...]
     factor: float
+    usual: float
     frame: Frame
 
     @property
     def cut(self) -> NDArray[np.bool_]:
         """Arrows (N,) that are drawn shorter than their factor says."""
-        return np.asarray(self.factor * self.frame.scale * np.hypot(*self.move_px.T) > LONGEST_SHOWN * ARROW_PART * max(BOX))
+        return np.asarray(self.factor * self.frame.scale * np.hypot(*self.move_px.T) > LONGEST_SHOWN * self.usual)
 
 
 def arrows_of(size_px: tuple[int, int], from_px: Array, move_px: Array, titles: tuple[str, ...]) -> Arrows:
     """Arrows enlarged by a round factor, 1 or more, on the part of a photograph (width, height) that holds them."""
-    frame = frame_of(*size_px, from_px)
+    near = cKDTree(from_px).query(from_px, k=2)[0][:, 1] if len(from_px) > 1 else np.zeros(1)
+    spacing = float(np.median(near)) or float(max(size_px))
+    # half the way to the next target is about what one takes up
+    frame = frame_of(*size_px, np.concatenate([from_px - spacing / 2, from_px + spacing / 2]))
+    usual = min(SPACING_PART * spacing * frame.scale, ARROW_PART * max(BOX))
     typical = float(np.quantile(np.hypot(*move_px.T), ARROW_QUANTILE)) * frame.scale
-    factor = max(1.0, round_length(ARROW_PART * max(BOX) / typical)) if typical > 0 else 1.0
-    return Arrows(from_px, move_px, titles, factor, frame)
+    factor = max(1.0, round_length(usual / typical)) if typical > 0 else 1.0
+    return Arrows(from_px, move_px, titles, factor, usual, frame)
 
 
 def arrows_svg(image: NDArray[np.generic] | None, arrows: Arrows, alt: str) -> str:
@@ -53,7 +61,7 @@ def arrows_svg(image: NDArray[np.generic] | None, arrows: Arrows, alt: str) -> s
     frame, cut = arrows.frame, arrows.cut
     start = frame.place(arrows.from_px)
     step = arrows.factor * frame.scale * arrows.move_px
-    longest = LONGEST_SHOWN * ARROW_PART * max(BOX)
+    longest = LONGEST_SHOWN * arrows.usual
     step = np.where(cut[:, None], step * (longest / np.maximum(np.hypot(*step.T), longest))[:, None], step)
     body = [_backdrop(image, frame)]
     body += [_arrow(s, d, title, CUT if c else PLAIN) for s, d, title, c in zip(start, step, arrows.titles, cut, strict=True)]
@@ -98,8 +106,8 @@ def _legend(arrows: Arrows) -> str:
     longest = float(np.hypot(*arrows.move_px.T).max())
     if longest == 0:
         return f'<text x="10" y="{middle + 8:.1f}" font-size="24" fill="{INK}">no target moved in the picture</text>'
-    key = round_length(ARROW_PART * max(BOX) / per_px)
+    key = round_length(arrows.usual / per_px)
     shape = _arrow(np.array([10.0, middle]), np.array([key * per_px, 0.0]), "", PLAIN)
-    words = f"{key:g} px in the picture, drawn {arrows.factor:g} times enlarged"
+    words = f"{key:g} px in the picture" + (f", drawn {arrows.factor:g} times enlarged" if arrows.factor > 1 else "")
     words += "; orange: cut, longer than drawn" if arrows.cut.any() else ""
     return f'{shape}<text x="{key * per_px + 34:.1f}" y="{middle + 8:.1f}" font-size="24" fill="{INK}">{words}</text>'

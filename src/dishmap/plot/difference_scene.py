@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError
 
 from dishmap.compare import DifferenceTable
-from dishmap.difference_verdict import set_aside, with_sigma
+from dishmap.difference_verdict import ROUNDING, set_aside, with_sigma
 from dishmap.plot.canvas import round_length
 
 Array = NDArray[Any]
@@ -18,6 +18,8 @@ Array = NDArray[Any]
 EXAGGERATED_PART = 0.12
 SCENE_MARGIN = 0.04
 FEW_TICKS = 4
+# A flat scene is drawn at least this high, a part of its width, so that the numbers on its axes do not meet.
+LEAST_HEIGHT = 0.3
 EYE = {"x": 0.55, "y": -1.05, "z": 0.72}
 DIVERGING = [[0.0, "#053061"], [0.25, "#6aacd0"], [0.5, "#f7f7f7"], [0.75, "#e58368"], [1.0, "#67001f"]]
 # The scale of colours reaches at least so many sigmas, and so does what fills the exaggerated part: noise is not blown up.
@@ -28,7 +30,7 @@ def exaggeration(table: DifferenceTable) -> float:
     """A round factor by which changes of shape are enlarged in the 3D picture, 1 or more."""
     limit = _limit(table)
     span = float(np.ptp(table.nominal_mm[:, :2], axis=0).max())
-    return max(1.0, round_length(EXAGGERATED_PART * span / limit)) if limit > 0 and span > 0 else 1.0
+    return max(1.0, round_length(EXAGGERATED_PART * span / limit)) if limit > ROUNDING and span > 0 else 1.0
 
 
 def difference_scene(table: DifferenceTable, normal: Array) -> tuple[list[dict[str, Any]], dict[str, Any]]:
@@ -81,6 +83,8 @@ def _axes(points: Array) -> dict[str, Any]:
     low, high = points.min(axis=0), points.max(axis=0)
     span = float((high - low).max()) or 1.0
     low, high = low - SCENE_MARGIN * span, high + SCENE_MARGIN * span
+    room = max(0.0, LEAST_HEIGHT * span - float(high[2] - low[2]))
+    low[2], high[2] = low[2] - room / 2, high[2] + room / 2
     axes: dict[str, Any] = {
         f"{name}axis": {"title": {"text": f"{name} (mm)"}, "range": [round(float(a), 3), round(float(b), 3)]}
         for name, a, b in zip("xyz", low, high, strict=True)
@@ -128,7 +132,8 @@ def _dots(table: DifferenceTable, points: Array, visible: bool) -> dict[str, Any
 
 
 def _colors(table: DifferenceTable) -> dict[str, Any]:
-    limit = _limit(table) or 1.0
+    limit = _limit(table)
+    limit = limit if limit > ROUNDING else 1.0
     return {"colorscale": DIVERGING, "cmin": -limit, "cmax": limit}
 
 

@@ -154,14 +154,22 @@ def project_printed(camera: Camera, poses: Poses, curvature_per_mm: Array, xy_mm
     return pixels, np.concatenate([moves, np.cross(local[:, :, None], turned)], axis=-1)
 
 
-def local_maps(camera: Camera, poses: Poses, curvature_per_mm: Array, patches: Patches, before: LocalMaps | None = None) -> LocalMaps:
-    """Fit the polynomial maps of M patches of T targets at their present poses; motion fields are taken from `before` if given."""
+def local_maps(
+    camera: Camera, poses: Poses, curvature_per_mm: Array, patches: Patches, before: LocalMaps | None = None, still: bool = False
+) -> LocalMaps:
+    """Fit the polynomial maps of M patches of T targets at their present poses; motion fields are taken from `before` if given.
+
+    `still`: without motion fields (zeros), where pixels are only chosen.
+    """
     many, curvature = poses.take(patches.target), curvature_per_mm[patches.target]
     for degree, most_px in zip(PLANE_DEGREES, MISFITS_PX, strict=True):
         plane, second, misfit = _plane_maps(camera, many, curvature, patches, degree)
         if np.max(np.where(np.isfinite(misfit), misfit, 0.0), initial=0.0) < most_px:
             break
-    motion = _motion_maps(camera, many, curvature, patches) if before is None else before.motion
+    if still:
+        motion = np.zeros((len(many), 2, 6, MOTION_TERMS))
+    else:
+        motion = _motion_maps(camera, many, curvature, patches) if before is None else before.motion
     return LocalMaps(plane, second, motion, misfit, degree)
 
 

@@ -22,9 +22,11 @@ from dishmap.targets.window import outline
 
 Array = NDArray[Any]
 Index = NDArray[np.int64]
+Bool = NDArray[Any]
 
-# Beyond this many blurs from an edge its ink adds under 0.1 % of the contrast.
-INK_BLURS = 3.2
+# Beyond this many blurs from an edge its ink adds under 0.1 % of the contrast; under 1.5 % beyond the second, which is for rings
+# that the first would leave too little of.
+INK_BLURS, LEAST_INK_BLURS = 3.2, 2.2
 # Rings of which the neighbours leave less than this share of the band are said to be occluded: what is left may hang on one side.
 LEAST_FREE = 0.5
 
@@ -59,10 +61,10 @@ def ink_of(camera: Camera, pattern: Pattern, parts: Iterable[tuple[TargetKind, I
     return Ink(np.concatenate(targets)[seen], center, metric, np.sqrt(np.maximum(values[:, 1], 1e-3)))
 
 
-def clear_of_neighbours(pixels: RingPixels, index: Index, ink: Ink, blur_px: float) -> RingPixels:
-    """`pixels` without those within INK_BLURS of other targets' ink; index (T,): which target of `ink` each target is."""
-    reach = INK_BLURS * blur_px
-    row, other = _close_pairs(pixels, index, ink, reach)
+def clear_of_neighbours(pixels: RingPixels, index: Index, ink: Ink, blur_px: Array) -> RingPixels:
+    """`pixels` without those within INK_BLURS of other targets' ink; index (T,): which target of `ink` each is, blur_px (T,)."""
+    blur = blur_px[pixels.target]
+    row, other = _close_pairs(pixels, index, ink, INK_BLURS * blur)
     if not len(row):
         return pixels
     scale = pixels.patches.scale_px[row, None]
@@ -73,17 +75,24 @@ def clear_of_neighbours(pixels: RingPixels, index: Index, ink: Ink, blur_px: flo
     rho = np.sqrt(du * gu + dv * gv)
     # distance outwards to first order, exact on the ellipse and for circles
     distance = (rho - 1) * rho / np.sqrt(np.maximum(gu * gu + gv * gv, 1e-12))
-    covered = np.zeros_like(pixels.used)
-    np.logical_or.at(covered, row, distance < reach)
-    covered &= pixels.used
+    nearest = np.full(pixels.s.shape, np.inf, np.float32)
+    np.minimum.at(nearest, row, distance.astype(np.float32))
+    nearest /= blur[:, None]
+    covered = pixels.used & (nearest < INK_BLURS)
     if not covered.any():
         return pixels
-    few = (pixels.used & ~covered).sum(axis=1) < LEAST_FREE * pixels.used.sum(axis=1)
+    few = _few_left(pixels.used, covered)
+    covered[few] = pixels.used[few] & (nearest[few] < LEAST_INK_BLURS)
+    few = _few_left(pixels.used, covered)
     return replace(pixels, used=pixels.used & ~(covered & ~few[:, None]), blocked=covered & few[:, None])
 
 
-def _close_pairs(pixels: RingPixels, index: Index, ink: Ink, reach_px: float) -> tuple[Index, Index]:
-    """Rings and ellipses of other targets that may come within reach of the rings' pixels."""
+def _few_left(used: Bool, covered: Bool) -> Bool:
+    return np.asarray((used & ~covered).sum(axis=1) < LEAST_FREE * used.sum(axis=1))
+
+
+def _close_pairs(pixels: RingPixels, index: Index, ink: Ink, reach_px: Array) -> tuple[Index, Index]:
+    """Rings and ellipses of other targets that may come within reach_px (M,) of the rings' pixels."""
     anchor, half = pixels.patches.anchor_px, pixels.patches.scale_px
     near = cKDTree(ink.center_px).query_ball_point(anchor, half + ink.reach_px.max(initial=0.0) + reach_px)
     row = np.repeat(np.arange(len(near)), [len(n) for n in near])
@@ -91,6 +100,8 @@ def _close_pairs(pixels: RingPixels, index: Index, ink: Ink, reach_px: float) ->
     gap = np.linalg.norm(anchor[row] - ink.center_px[other], axis=1)
     # an ellipse that holds the ring's middle is not beside it
     close = (
-        (gap < half[row] + ink.reach_px[other] + reach_px) & (gap > ink.reach_px[other]) & (ink.target[other] != index[pixels.target[row]])
+        (gap < half[row] + ink.reach_px[other] + reach_px[row])
+        & (gap > ink.reach_px[other])
+        & (ink.target[other] != index[pixels.target[row]])
     )
     return row[close], other[close]

@@ -67,9 +67,9 @@ class TargetPoses:
     photograph's noise; information (N, 7, 7) and pull (N, 7): what the pixels alone say of a change of (move, turn, edge
     offset in mm), as the Gaussian log-likelihood pull . x - x . information x / 2, without the priors on normal and
     edge offset that `covariance` holds; prior (N, 7): the precision of those priors; center_px (N, 2) and covariance_px2
-    (N, 2, 2) of the projected target centre; sigma_normal_rad (N,) root mean square angle; calibration_jacobian (N, 3, P) d position / d camera parameters; blur_px (N,) total blur,
-    offset_mm (N,) edge offset, contrast, noise (N,) grey levels; kept (N,) smallest share of a circle's edge that was used;
-    quality (N,) bits of `Quality`.
+    (N, 2, 2) of the projected target centre; sigma_normal_rad (N,) root mean square angle; calibration_jacobian (N, 3, P)
+    d position / d camera parameters; blur_px (N,) total blur, offset_mm (N,) edge offset, contrast, noise (N,) grey levels;
+    kept (N,) smallest share of a circle's edge that was used; quality (N,) bits of `Quality`.
     camera_from_dish: rigid pose of the undeformed pattern; normal_sigma_rad: spread of normals about the pattern's surface,
     used as a prior; noise_model: of the photograph; rejected: (id, reason) of named targets that could not be measured.
     """
@@ -305,7 +305,10 @@ def _quality(
 
     outlines = group.outlines()
     flag(~np.asarray(group.batch.camera.contains(outlines, margin_px=1.0).all(axis=(1, 2))), Quality.CLIPPED)
-    flag(~adjusted.converged, Quality.NOT_CONVERGED)
+    known = [columns[name].reshape(count, -1) for name in ("position_mm", "rotation", "covariance", "covariance_px2")]
+    known += [columns[name].reshape(count, -1) for name in ("information", "pull", "prior", "calibration_jacobian")]
+    finite = np.isfinite(np.concatenate(known, axis=1)).all(axis=1)
+    flag(~(adjusted.converged & finite), Quality.NOT_CONVERGED)
     flag(columns["contrast"] < LEAST_CONTRAST_SIGMAS * columns["noise"], Quality.NO_CONTRAST)
     flag(adjusted.noise_variance > POOR_FIT_RATIO, Quality.POOR_FIT)
     across = np.linalg.norm(outlines - outlines.mean(axis=2, keepdims=True), axis=3).min(axis=2)
@@ -318,9 +321,9 @@ def _quality(
     flag((lost & ~bright) | dropped, Quality.OCCLUDED)
     if group.ambiguous is not None:
         flag(group.ambiguous, Quality.AMBIGUOUS_NORMAL)
-    known = [i for i in range(GEOMETRY) if i not in (OFFSET_MM, OFFSET_PX)]
+    rest = [i for i in range(GEOMETRY) if i not in (OFFSET_MM, OFFSET_PX)]
     free = inverse_scaled(information)[:, 2, 2]
-    fixed = inverse_scaled(information[:, known][:, :, known])[:, 2, 2]
+    fixed = inverse_scaled(information[:, rest][:, :, rest])[:, 2, 2]
     flag(free > WEAK_DEPTH_RATIO**2 * fixed, Quality.WEAK_DEPTH)
     return bits
 

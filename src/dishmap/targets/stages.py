@@ -20,7 +20,7 @@ from dishmap.targets.adjust import (
     with_rest,
 )
 from dishmap.targets.detect import Detections
-from dishmap.targets.edges import Poses
+from dishmap.targets.edges import Poses, local_maps
 from dishmap.targets.identify import Identity
 from dishmap.targets.neighbours import Ink, clear_of_neighbours, ink_of
 from dishmap.targets.pattern import Pattern, TargetKind
@@ -62,8 +62,8 @@ LEAST_KEPT = 0.7
 LEAST_CONTRAST_SHARE = 0.5
 # Share of an edge below which something is in front of it, and how far from the lost pixels its border reaches, in blurs.
 OCCLUDED_BELOW, OBSTACLE_BLURS = 0.97, 2.0
-# A ring's cut may exceed the picture's usual one, relative to contrast, by this factor.
-WIDEST_CUT = 1.5
+# A ring's cut may exceed the picture's usual one, relative to contrast, by this factor, and its blur the usual blur.
+WIDEST_CUT, WIDEST_BLUR = 1.5, 1.3
 
 
 @dataclass(frozen=True)
@@ -240,18 +240,29 @@ def layout(image: NDArray[Any], group: Group, blur_px: float, band_blur_px: floa
     patches = patches_around(batch.camera, group.poses, batch.curvature_per_mm, areas, band_blur_px)
     ends = outline(batch.camera, group.poses, batch.curvature_per_mm, *areas).reshape(len(patches.target), -1, 2)
     half = np.nan_to_num(np.abs(ends - patches.anchor_px[:, None]).max(axis=(1, 2)), nan=1.0)
-    return batch, ring_pixels(image, rings, batch.maps(group.poses, patches), patches, half, band_blur_px, fine)
+    maps = local_maps(batch.camera, group.poses, batch.curvature_per_mm, patches, still=True)
+    return batch, ring_pixels(image, rings, maps, patches, half, band_blur_px, fine)
 
 
 def coarse_fit(image: NDArray[Any], group: Group, ink: Ink) -> Coarse:
     """Fit every fourth pixel of a wide band, first all of them, then without outliers."""
-    batch, pixels = layout(image, group, FIRST_BLUR_PX, FIRST_BAND_BLUR_PX)
-    # one pixel of each block of 2x2, and fewer blocks of large rings
-    pixels = clear_of_neighbours(pixels.every(4 * max(1, pixels.s.shape[1] // COARSE_PIXELS)), group.index, ink, FIRST_BLUR_PX)
+    batch, pixels = _coarse_layout(image, group, ink, FIRST_BLUR_PX, FIRST_BAND_BLUR_PX)
     first = adjust(batch, pixels, group.poses, group.state, Weighting(1.0, 0.0, None), FIRST_STEPS)
+    blur = float(np.median(first.state.blur_px))
+    if blur > FIRST_BAND_BLUR_PX and np.isfinite(first.poses.position_mm).all():
+        # rings less sharp than that may need another model, or else they would seem to show a tone curve
+        batch, pixels = _coarse_layout(image, replace(group, poses=first.poses, state=first.state), ink, blur, blur)
+        first = adjust(batch, pixels, first.poses, first.state, Weighting(1.0, 0.0, None), FIRST_STEPS)
     cut = residual_cut(first, pixels)
     second = adjust(batch, pixels, first.poses, first.state, Weighting(1.0, 0.0, cut), COARSE_STEPS, COARSE_ENOUGH)
     return Coarse(replace(group, poses=second.poses, state=second.state, batch=batch), second, pixels, residual_cut(second, pixels))
+
+
+def _coarse_layout(image: NDArray[Any], group: Group, ink: Ink, blur_px: float, band_blur_px: float) -> tuple[Batch, RingPixels]:
+    batch, pixels = layout(image, group, blur_px, band_blur_px)
+    # one pixel of each block of 2x2, and fewer blocks of large rings
+    pixels = pixels.every(4 * max(1, pixels.s.shape[1] // COARSE_PIXELS))
+    return batch, clear_of_neighbours(pixels, group.index, ink, np.full(len(group.index), blur_px))
 
 
 def residual_cut(adjusted: Adjusted, pixels: RingPixels) -> Array:
@@ -304,9 +315,9 @@ def shared_tone(coarse: list[Coarse]) -> tuple[float, float]:
     data = np.maximum(1 / variance[good] - FIRST_LOG_GAMMA_SIGMA**-2, 1e-9)
     free = value[good] / np.maximum(variance[good] * data, 1e-9)
     near = np.abs(free - np.median(free)) < STRAY_SIGMAS / np.sqrt(data) + 1e-3
-    total = data[near].sum()
-    sigma = max(total**-0.5, LEAST_LOG_GAMMA_SIGMA)
-    return float(np.clip((data[near] * free[near]).sum() / total, -1.2, 1.2)), float(min(sigma, FIRST_LOG_GAMMA_SIGMA))
+    # and put the prior in once, for all
+    total = data[near].sum() + FIRST_LOG_GAMMA_SIGMA**-2
+    return float((data[near] * free[near]).sum() / total), max(float(total**-0.5), LEAST_LOG_GAMMA_SIGMA)
 
 
 def full_fit(image: NDArray[Any], pattern: Pattern, coarse: Coarse, shared: Shared, ink: Ink) -> Fit:
@@ -318,9 +329,11 @@ def full_fit(image: NDArray[Any], pattern: Pattern, coarse: Coarse, shared: Shar
     priors = replace(priors, log_gamma=shared.log_gamma, log_gamma_sigma=shared.log_gamma_sigma)
     poses, state = with_other_priors(coarse.adjusted, group.batch.priors, priors)
     group = replace(group, poses=poses, state=state, batch=replace(group.batch, priors=priors))
-    widest = float(np.quantile(group.state.blur_px, 0.9))
+    # something in front of a target widens its blur: no target may seem much less sharp than the others
+    blurs = np.minimum(group.state.blur_px, WIDEST_BLUR * blur)
+    widest = float(np.quantile(blurs, 0.9))
     batch, pixels = layout(image, group, widest, widest)
-    pixels = clear_of_neighbours(pixels, group.index, ink, widest)
+    pixels = clear_of_neighbours(pixels, group.index, ink, np.maximum(blurs, blur))
     cut, pixels = _without_bad_rings(coarse, pixels, shared)
     weighting = Weighting(shared.noise.base, shared.noise.slope, cut)
     adjusted = adjust(batch, pixels, group.poses, group.state, weighting, FULL_STEPS)
