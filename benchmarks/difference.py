@@ -57,8 +57,6 @@ SEEDS = 2 if QUICK else 8
 CONTRAST = 60
 # What the project asks for, in mm; an outlier may cost a factor.
 GOAL_DEPTH, GOAL_STILL, GOAL_SHAPE, GOAL_SAME, GOAL_DIRTY = 0.015, 0.006, 0.03, 0.01, 1.3
-# A target counts as hidden when less of its ink than this is seen.
-SEEN = 0.999
 # Of the Zernike terms that data/dish's displacements are resolved into.
 DEGREE = 6
 # Of the paper's surface: enough for all of data/dish.

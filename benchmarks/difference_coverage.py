@@ -387,21 +387,26 @@ def main() -> None:
     print(f"{len(trials)} dishes of {len(benches()[0].pattern)} targets; asked: coverage {low:.0f} to {high:.0f} %, efficiency over")
     print(f"{GOAL_EFFICIENCY}, no change below {GOAL_STILL_MM} mm; a miss is named where chance is unlikely to be the reason")
 
-    def table(header: Sequence[str], row: Callable[[Sequence[Trial]], tuple[object, ...]], names: Sequence[str], title: str) -> None:
+    def table(
+        header: Sequence[str],
+        row: Callable[[Sequence[Trial]], tuple[object, ...]],
+        names: Sequence[str],
+        title: str,
+        among: Sequence[Trial],
+    ) -> None:
         groups: dict[str, list[Trial]] = {}
-        for t in trials:
+        for t in among:
             groups.setdefault(", ".join(str(getattr(t, name)) for name in names) or "all", []).append(t)
         print_table(header, [(name, *row(group)) for name, group in groups.items()], title)
 
-    trials.sort(key=lambda t: rms(t.true_shape) if t.family != "none" else 0.0)
-    table(HEADER, row_of, ("size",), "Errors and coverage by the rms of the true shape")
-    table(LEARNT, learnt_row, ("size",), "What was learnt, by the rms of the true shape")
-    trials.sort(key=lambda t: [*FAMILIES].index(t.family))
+    by_size = sorted(trials, key=lambda t: rms(t.true_shape))
     for names in ((), ("family",), ("camera",), ("slide",)):
-        table(HEADER, row_of, names, f"Errors and coverage by {names[0]}" if names else "All")
+        table(HEADER, row_of, names, f"Errors and coverage by {names[0]}" if names else "All", trials)
+    table(HEADER, row_of, ("size",), "Errors and coverage by the rms of the true shape", by_size)
+    table(LEARNT, learnt_row, ("size",), "What was learnt: mean weights of the ways, medians under the best hypothesis", by_size)
     each = ("family", "camera", "slide")
-    table(HEADER, row_of, each, "Errors and coverage of each group")
-    table(LEARNT, learnt_row, each, "What was learnt: mean weights of the ways, medians under the best hypothesis")
+    table(HEADER, row_of, each, "Errors and coverage of each group", trials)
+    table(LEARNT, learnt_row, each, "What was learnt in each group", trials)
 
 
 if __name__ == "__main__":

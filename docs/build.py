@@ -61,6 +61,8 @@ def page(source: Path) -> str:
         for child in token.children or []:
             if child.type == "link_open":
                 child.attrSet("href", site_link(source, str(child.attrGet("href"))))
+            elif child.type == "image":
+                child.attrSet("src", site_link(source, str(child.attrGet("src"))))
     return FRAME.format(title=html.escape(title), body=markdown.renderer.render(tokens, markdown.options, {}))
 
 
@@ -81,7 +83,7 @@ def broken_links() -> list[str]:
     linked = {"index.html"}
     for name in PAGES.values():
         text = (SITE / name).read_text(encoding="utf-8")
-        for link in re.findall(r'href="([^"]+)"', text):
+        for link in re.findall(r'(?:href|src)="([^"]+)"', text):
             path, _, anchor = html.unescape(link).partition("#")
             if "://" in link:
                 continue

@@ -50,16 +50,19 @@ ORDER = [
     *("difference.outline", "difference.profile", "difference.circle", "difference.rimfit", "difference.rim"),
     # and as we have it: one estimate of everything that may have moved
     *("difference.response", "difference.changes", "difference.priors", "difference.model", "difference.joint"),
-    *("difference.estimate", "difference.difference_map"),
+    *("difference.estimate", "difference.difference_map", "difference.bound"),
     # photographs with truth
     *("simulate.deform", "simulate.scene", "simulate.forward", "simulate.truth", "simulate.contour", "simulate.render"),
     *("simulate.scenario",),
     # all of it in one short function
     *("pipeline", "compare", "figures"),
+    # paper to print
+    *("sheet.shapes", "sheet.pdf", "sheet.svg", "sheet.flatten", "sheet.pieces", "sheet.seams", "sheet.gores", "sheet.markers"),
+    *("sheet.boards", "sheet.outline", "sheet.paper", "sheet.tiles", "sheet.layout", "sheet.printed", "sheet.sheets"),
     # files
     *("io.atomic", "io.image_header", "io.images", "io.picture_file", "io.pose_file", "io.camera_file", "io.pattern_file"),
     *("io.scenario_file", "io.truth_file", "io.points_file", "io.measurement_file", "io.results"),
-    *("io.difference_file", "io.difference_results"),
+    *("io.difference_file", "io.difference_results", "io.sheet_file"),
     # people: what a map says in words, in pictures, on a page
     *("verdict", "plot.canvas", "plot.photograph", "plot.maps", "plot.outlines", "plot.scene", "plot.calibration", "page", "report"),
     # and what a difference says
@@ -67,7 +70,7 @@ ORDER = [
     *("difference_report",),
     # the program
     *("cli.terminal", "cli.options", "cli.prior_options", "cli.outcome", "cli.difference_outcome"),
-    *("cli.calibrate", "cli.pattern", "cli.simulate", "cli.undistort"),
+    *("cli.calibrate", "cli.pattern", "cli.sheet", "cli.simulate", "cli.undistort"),
     *("cli.map", "cli.diff", "cli.demo", "cli.app", "__main__"),
 ]
 
@@ -89,6 +92,7 @@ WALLS = {
         "io.picture_file",
         "plot",
         "difference.outline",
+        "sheet.markers",
     ],
     # files that people write are checked where they are read
     "pydantic": ["io", "cli"],

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dishmap.camera.board import BoardView
 from dishmap.camera.calibrate import Calibration
-from dishmap.camera.chessboard import BoardView
 from dishmap.camera.model import Camera
 from dishmap.errors import ImageError
 from dishmap.page import script_json

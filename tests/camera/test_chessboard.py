@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dishmap.camera.chessboard import BoardView, chessboard_mm, find_boards, find_chessboard, fit_corners
+from dishmap.camera.board import BoardView
+from dishmap.camera.chessboard import chessboard_mm, find_boards, find_chessboard, fit_corners
 from dishmap.errors import ImageError, InputError, MeasurementError
 from dishmap.transforms import rotation_from_vector
 

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
+from dishmap.camera.board import BoardView
 from dishmap.camera.calibrate import Calibration
-from dishmap.camera.chessboard import BoardView
 from dishmap.camera.model import Camera
 from dishmap.errors import CameraError, InputError
 from dishmap.io.camera_file import camera_text, read_camera, read_views, write_camera

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from dishmap.targets.scene_noise import LEAST_NORMAL_SIGMA_RAD, NoiseModel, noise_model, normal_spread
+from dishmap.targets.scene_noise import LEAST_NORMAL_SIGMA_RAD, NoiseModel, inflation_of, noise_model, normal_spread
 
 Array = NDArray[np.float64]
 
@@ -26,7 +28,10 @@ def levels(rng: np.random.Generator) -> Array:
 
 
 def fitted(model: Array, residual: Array, blocks: bool = True, used: NDArray[np.bool_] | None = None) -> NoiseModel:
-    return noise_model([model + residual], [residual], [np.ones(model.shape, bool) if used is None else used], [blocks])
+    used = np.ones(model.shape, bool) if used is None else used
+    pairs = [(residual, used)] if blocks else []
+    inflation = inflation_of([r for r, _ in pairs], [u for _, u in pairs])
+    return replace(noise_model([model + residual], [residual], [used]), inflation=inflation)
 
 
 def in_blocks(image: Array, rng: np.random.Generator) -> Array:

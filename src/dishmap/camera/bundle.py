@@ -3,14 +3,11 @@
 Each view's pose touches only its own residuals, so the normal equations are an arrow: with the poses eliminated (Schur
 complement) there is one small system for camera and board, whatever the number of views (Triggs et al. 2000, section 6).
 Camera parameters and the board's bends are called *shared* here: each view has them in common.
-
-Most sensors are read row by row, and what moves meanwhile is seen sheared. A view may therefore have a drift: the small
-motion (turn and shift) of the board against the camera from the first row to the last.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +19,7 @@ from dishmap.transforms import cross_matrix, rotation_from_vector
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-POSE, DRIFT = 6, 6
+POSE = 6
 # Powers of the radius with which k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 act, relative to the radius itself.
 OPENCV_POWERS, FISHEYE_POWERS = (2, 4, 1, 1, 6, 2, 4, 6, 1, 3, 1, 3), (2, 4, 6, 8)
 STIFFNESS = 0.5
@@ -41,17 +38,15 @@ SMALLEST_SCALE_PX = 0.01
 
 @dataclass(frozen=True)
 class BoardCorners:
-    """Corners of all views in one run: pixels (M, 2), board_mm (M, 3), and where each view starts (V + 1,).
+    """Corners of all views in one run: pixels (M, 2), board_mm (M, 3), where each view starts (V + 1,), how the board can bend.
 
-    bends (M, F): height in mm of each corner over the flat board when a bend has size 1 mm (`board.bends_of`). time (M,): when it
-    was read, from -0.5 at the picture's first row to 0.5 at its last; None where all is seen at once, so that views have no drift.
+    bends (M, F): height in mm of each corner over the flat board when a bend has size 1 mm (`board.bends_of`).
     """
 
     pixels: Array
     board_mm: Array
     bounds: NDArray[np.int64]
     bends: Array
-    time: Array | None = None
 
     @property
     def slices(self) -> list[slice]:
@@ -66,16 +61,12 @@ class BoardCorners:
 
 @dataclass(frozen=True)
 class Bundle:
-    """A camera, the board's pose in each view, camera from board: rotation (V, 3, 3), translation_mm (V, 3), and its bends (F,) in mm.
-
-    drift (V, 6): of each view, turn in rad about the board's origin and shift in mm over the time of one picture.
-    """
+    """A camera, the board's pose in each view, camera from board: rotation (V, 3, 3), translation_mm (V, 3), and its bends (F,) in mm."""
 
     camera: Camera
     rotation: Array
     translation_mm: Array
     bend_mm: Array
-    drift: Array
 
     @property
     def shared(self) -> Array:
@@ -84,15 +75,7 @@ class Bundle:
 
     def residuals(self, corners: BoardCorners) -> Array:
         """Measured minus projected (M, 2), px; NaN where the lens model does not reach."""
-        return corners.pixels - self.camera.project(self.seen(self.turned(corners), corners))
-
-    def seen(self, turned: Array, corners: BoardCorners) -> Array:
-        """Turned corners (M, 3) where the camera sees them, in its frame."""
-        shifted = turned + self.translation_mm[corners.view]
-        if corners.time is None:
-            return shifted
-        drift = self.drift[corners.view]
-        return shifted + corners.time[:, None] * (np.cross(drift[:, :3], turned) + drift[:, 3:])
+        return corners.pixels - self.camera.project(self.turned(corners) + self.translation_mm[corners.view])
 
     def turned(self, corners: BoardCorners) -> Array:
         """Corners of the bent board (M, 3), turned as the camera sees them but not yet shifted."""
@@ -101,18 +84,20 @@ class Bundle:
         return np.einsum("mij,mj->mi", self.rotation[corners.view], board)
 
     def moved(self, free: Mask, shared_step: Array, pose_steps: Array) -> Bundle:
-        """Return the bundle after a step: shared parameters added, rotations turned on the left, translations and drifts added."""
+        """Return the bundle after a step: shared parameters added, rotations turned on the left, translations added."""
         shared = self.shared
         shared[free] += shared_step
-        count = len(self.camera.parameters)
         rotation = rotation_from_vector(pose_steps[:, :3]) @ self.rotation
-        drift = self.drift + pose_steps[:, POSE:] if pose_steps.shape[1] > POSE else self.drift
-        translation = self.translation_mm + pose_steps[:, 3:POSE]
-        return Bundle(self.camera.with_parameters(shared[:count]), rotation, translation, shared[count:], drift)
+        return replace(self.with_shared(shared), rotation=rotation, translation_mm=self.translation_mm + pose_steps[:, 3:])
+
+    def with_shared(self, shared: Array) -> Bundle:
+        """The bundle with other camera parameters and bends (P + F,)."""
+        count = len(self.camera.parameters)
+        return replace(self, camera=self.camera.with_parameters(shared[:count]), bend_mm=shared[count:])
 
     def of_views(self, keep: Mask) -> Bundle:
         """The bundle of some of the views (V,)."""
-        return Bundle(self.camera, self.rotation[keep], self.translation_mm[keep], self.bend_mm, self.drift[keep])
+        return Bundle(self.camera, self.rotation[keep], self.translation_mm[keep], self.bend_mm)
 
 
 @dataclass(frozen=True)
@@ -122,15 +107,14 @@ class Prior:
     About `expected` (P,), the focal lengths may move by themselves and the principal point by the half picture; at `radius` (tangent
     off the axis, of the farthest corner), each lens term may move a point by STIFFNESS of its distance from the axis.
     Without this the terms of a rational lens, which can stand in for each other, run away, and so does the focal length when
-    all views are alike. Bends may be bend_mm large (sigma), about none, and drifts as `drift` (6,) says. noise_px: sigma of one
-    coordinate, which says what a corner weighs against the prior.
+    all views are alike. Bends may be bend_mm large (sigma), about none. noise_px: sigma of one coordinate, which says what a
+    corner weighs against the prior.
     """
 
     expected: Array
     radius: float
     noise_px: float
     bend_mm: float
-    drift: Array
 
     def precision(self, bundle: Bundle) -> Array:
         """Precision of each shared parameter times the noise's variance (P + F,), in px^2 over the parameter's unit squared."""
@@ -146,19 +130,14 @@ class Prior:
 
     def cost(self, bundle: Bundle) -> float:
         """What it adds to the sum of squares, px^2."""
-        return float(self.precision(bundle) @ self.pull(bundle) ** 2 + (bundle.drift**2 @ self.drift_precision).sum())
-
-    @property
-    def drift_precision(self) -> Array:
-        """Precision of a view's drift times the noise's variance (6,)."""
-        return (self.noise_px / self.drift) ** 2
+        return float(self.precision(bundle) @ self.pull(bundle) ** 2)
 
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Blocks of J^T W J and J^T W r for each view: shared (V, S, S), mixed (V, S, K), pose (V, K, K), and both right sides.
+    """Blocks of J^T W J and J^T W r for each view: shared (V, S, S), mixed (V, S, 6), pose (V, 6, 6), and both right sides.
 
-    A view has K = 6 parameters of its own, 12 with drift, whose prior is in `pose` and `pose_side`. prior (S,), prior_side (S,): what `Prior` adds to the shared block, once for all views.
+    prior (S,), prior_side (S,): what `Prior` adds to the shared block, once for all views.
     """
 
     shared: Array
@@ -173,48 +152,32 @@ class NormalEquations:
 def normal_equations(bundle: Bundle, corners: BoardCorners, free: Mask, weights: Array, prior: Prior) -> NormalEquations:
     """Linearise the projections of a bundle; weights (M,), free (P + F,) tells which shared parameters are estimated."""
     turned = bundle.turned(corners)
-    pixels, by_point, by_camera = bundle.camera.project_with_jacobians(bundle.seen(turned, corners))
+    pixels, by_point, by_camera = bundle.camera.project_with_jacobians(turned + bundle.translation_mm[corners.view])
     residual = corners.pixels - pixels
-    by_turned = by_point
-    if corners.time is not None:
-        by_turned = by_point @ (np.eye(3) + corners.time[:, None, None] * cross_matrix(bundle.drift[corners.view, :3]))
-    upwards = (by_turned @ bundle.rotation[corners.view][..., 2:]) * corners.bends[:, None]
+    upwards = (by_point @ bundle.rotation[corners.view][..., 2:]) * corners.bends[:, None]
     by_shared = np.concatenate([by_camera, upwards], axis=-1)[..., free]
-    turn = cross_matrix(turned)
-    by_view = [-by_turned @ turn, by_point]
-    if corners.time is not None:
-        time = corners.time[:, None, None]
-        by_view += [-by_point @ turn * time, by_point * time]
-    rows = np.concatenate([by_shared, *by_view, residual[..., None]], axis=-1)
+    rows = np.concatenate([by_shared, -by_point @ cross_matrix(turned), by_point, residual[..., None]], axis=-1)
     rows *= np.sqrt(weights)[:, None, None]
     rows[weights == 0] = 0.0  # where the lens model ends they are NaN
     n = int(free.sum())
-    own = rows.shape[-1] - n - 1
-    blocks = np.stack([(part := rows[s].reshape(-1, n + own + 1)).T @ part for s in corners.slices])
-    p = slice(n, n + own)
-    pose, pose_side = blocks[:, p, p], blocks[:, p, -1]
-    if corners.time is not None:
-        drift = prior.drift_precision
-        pose[:, POSE:, POSE:] += np.diag(drift)
-        pose_side[:, POSE:] -= drift * bundle.drift
+    blocks = np.stack([(part := rows[s].reshape(-1, n + POSE + 1)).T @ part for s in corners.slices])
+    p = slice(n, n + POSE)
     precision = prior.precision(bundle)[free]
-    return NormalEquations(
-        blocks[:, :n, :n], blocks[:, :n, p], pose, blocks[:, :n, -1], pose_side, precision, -precision * prior.pull(bundle)[free]
-    )
+    sides = blocks[:, :n, -1], blocks[:, p, -1]
+    return NormalEquations(blocks[:, :n, :n], blocks[:, :n, p], blocks[:, p, p], *sides, precision, -precision * prior.pull(bundle)[free])
 
 
 def reduced(equations: NormalEquations, damping: float = 0.0) -> tuple[Array, Array, Array, Array]:
-    """Eliminate the poses. Returns shared matrices (V, S, S), right sides (V, S), and the poses' answers (V, K, S), (V, K).
+    """Eliminate the poses. Returns shared matrices (V, S, S), right sides (V, S), and the poses' answers (V, 6, S), (V, 6).
 
     Their sums over the views, with the prior, are the shared system; a view's pose step is `answer - by_shared @ shared_step`.
     """
     diagonal = np.einsum("vii->vi", equations.pose)
-    unit = np.eye(diagonal.shape[1])
-    pose = equations.pose + (damping * diagonal)[:, :, None] * unit
+    pose = equations.pose + (damping * diagonal)[:, :, None] * np.eye(POSE)
     both = np.concatenate([np.swapaxes(equations.mixed, 1, 2), equations.pose_side[..., None]], axis=-1)
     # units differ (radians, mm), so the system is solved with a unit diagonal
     scale = 1 / np.sqrt(np.maximum(diagonal, 1e-300))[..., None]
-    system = pose * scale * np.swapaxes(scale, 1, 2) + LEAST_DAMPING * unit  # a view without weight stays where it is
+    system = pose * scale * np.swapaxes(scale, 1, 2) + LEAST_DAMPING * np.eye(POSE)  # a view without weight stays where it is
     answer = scale * np.linalg.solve(system, scale * both)
     by_shared, plain = answer[..., :-1], answer[..., -1]
     matrix = equations.shared - equations.mixed @ by_shared

@@ -50,6 +50,8 @@ LARGEST_SIGMA_OF_SIDE = 0.005
 # Convergence: a remaining step under a tenth of the smallest error that could matter.
 LARGEST_STEP_SIGMAS = 0.1
 WEAK_VIEWS, WEAK_COVERAGE = 8, 0.4
+# A focal length that changes from view to view explains most of the residuals; one parameter of 100 explains 1 % of noise.
+UNSTABLE_PART = 0.5
 COVERAGE_CELLS = 8
 
 
@@ -63,7 +65,7 @@ class Calibration:
     used corners, as OpenCV's. sigma_px: noise of one coordinate. inflation: factor by which sigmas were enlarged, on
     average, for correlation within views. coverage: part of the picture where corners were seen. rejected: name and reason of
     views left out. notes: sentences on what makes this calibration weak. board: how the board is bent. expected (P,): what the
-    prior on the camera is about.
+    prior on the camera is about. independent: part of the noise that was taken as independent from corner to corner.
     """
 
     camera: Camera
@@ -82,6 +84,7 @@ class Calibration:
     view_weight: Array
     board: BoardShape
     expected: Array
+    independent: float
 
     @property
     def view_names(self) -> tuple[str, ...]:
@@ -162,7 +165,7 @@ def _start(camera: Camera, corners: BoardCorners) -> Bundle:
         rays = trial.unproject(corners.pixels)
         if not np.isfinite(rays).all():
             continue
-        bundle = Bundle(trial, *_planar_poses(rays, corners), np.zeros(len(BENDS)), np.zeros((len(corners.slices), ba.DRIFT)))
+        bundle = Bundle(trial, *_planar_poses(rays, corners), np.zeros(len(BENDS)))
         length = np.linalg.norm(bundle.residuals(corners), axis=1)
         score = float(np.median(np.where(np.isfinite(length), length, np.inf)))
         if best is None or score < best[0]:
@@ -210,7 +213,7 @@ def _result(
         raise MeasurementError(f"the best camera misses the corners by {sigma:.3g} px; {CHECK_INPUT}")
     equations = ba.normal_equations(bundle, corners, free, weights, problem.prior(bundle, corners, weights))
     _check_turn(bundle)
-    covariance, inflation = shared_covariance(bundle.camera, equations, sigma)
+    covariance, inflation, independent = shared_covariance(bundle.camera, equations, sigma)
     if ba.step_in_sigmas(equations, max(sigma, LEAST_NOISE_PX)) > LARGEST_STEP_SIGMAS:
         raise FitError("the calibration did not reach its best fit; use more views, or a lens with fewer coefficients")
     parts = [residuals[s] for s in corners.slices]
@@ -229,11 +232,12 @@ def _result(
         inflation=inflation,
         coverage=coverage,
         rejected=rejected,
-        notes=_notes(bundle, coverage),
+        notes=(*_notes(bundle, coverage), *_unstable_focal(bundle, equations, float((weights * square)[good].sum()))),
         lens=lens,
         view_weight=weight,
         board=BoardShape(problem.middle_mm, problem.half_mm, bundle.bend_mm, bends, not problem.flat),
         expected=problem.expected,
+        independent=independent,
     )
 
 
@@ -252,8 +256,9 @@ def _check_turn(bundle: Bundle) -> None:
         )
 
 
-def shared_covariance(camera: Camera, equations: ba.NormalEquations, sigma_px: float) -> tuple[Array, float]:
-    """Covariance of camera parameters and bends with the poses marginalised out, and the mean factor of its sigmas for clustering.
+def shared_covariance(camera: Camera, equations: ba.NormalEquations, sigma_px: float) -> tuple[Array, float, float]:
+    """Covariance of camera parameters and bends with the poses marginalised out, the mean factor of its sigmas for clustering, and the
+    part of the noise that is taken as independent.
 
     In coordinates where independent noise gives the unit matrix, each view adds the outer product of its score, adjusted for
     its leverage (CR2 of Bell and McCaffrey 2002: unbiased if corners are independent). With 10 to 20 views the sum is noisy, so it is
@@ -266,7 +271,7 @@ def shared_covariance(camera: Camera, equations: ba.NormalEquations, sigma_px: f
     root = scale[:, None] * vectors / np.sqrt(np.maximum(values, 1e-30))  # root @ root.T inverts the information
     _check_determined(camera, root, max(sigma_px, LEAST_NOISE_PX))
     if sigma_px < LEAST_NOISE_PX * 1e-6:  # simulated corners without noise: there is nothing to learn about correlation
-        return sigma_px**2 * root @ root.T, 1.0
+        return sigma_px**2 * root @ root.T, 1.0, 1.0
     scores = sides @ root / sigma_px
     leverage, axes = np.linalg.eigh(np.swapaxes(root, 0, 1) @ matrices @ root)
     scores = np.einsum("vij,vj,vkj,vk->vi", axes, 1 / np.sqrt(np.maximum(1 - leverage, 1e-6)), axes, scores)
@@ -278,7 +283,7 @@ def shared_covariance(camera: Camera, equations: ba.NormalEquations, sigma_px: f
     part = min(1.0, scatter / max(distance, 1e-300))
     shrunk = ((1 - part) * spread + part * mean * np.eye(size)) * max(1.0, 1 / mean)
     covariance = sigma_px**2 * root @ shrunk @ root.T
-    return (covariance + covariance.T) / 2, float(np.sqrt(max(1.0, mean)))
+    return (covariance + covariance.T) / 2, float(np.sqrt(max(1.0, mean))), part
 
 
 def _check_determined(camera: Camera, root: Array, noise_px: float) -> None:
@@ -290,6 +295,22 @@ def _check_determined(camera: Camera, root: Array, noise_px: float) -> None:
             f"{camera.focal_px.min():.4g} px); add views with the board tilted by 20 to 40 degrees to different sides and filling the "
             "picture, or use a lens with fewer coefficients"
         )
+
+
+def _unstable_focal(bundle: Bundle, equations: ba.NormalEquations, cost_px2: float) -> tuple[str, ...]:
+    """A note if a focal length of its own for each view would explain much of what is left: autofocus does that."""
+    matrices, sides, _, _ = ba.reduced(equations)
+    along = np.zeros(matrices.shape[-1])
+    along[:2] = bundle.camera.focal_px / bundle.camera.focal_px.mean()
+    side, information = sides @ along, np.maximum(along @ matrices @ along, 1e-300)
+    explained = float((side**2 / information).sum() / max(cost_px2, 1e-300))
+    if explained < UNSTABLE_PART or cost_px2 < len(sides) * ba.ROUNDING_PX:
+        return ()
+    spread = float(np.std(side / information) / bundle.camera.focal_px.mean())
+    return (
+        f"the focal length seems to differ from view to view by {spread:.1%}; switch off autofocus, zoom and image stabilisation "
+        "and photograph again",
+    )
 
 
 def _coverage(camera: Camera, pixels: Array) -> float:

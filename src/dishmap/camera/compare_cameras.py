@@ -72,11 +72,12 @@ def covered_area(pixels: Array, seen_px: Array) -> Mask:
     return np.asarray(np.isfinite(distance))
 
 
-def camera_difference(first: Camera, second: Camera, distance_mm: float, seen_px: Array | None = None) -> CameraDifference:
+def camera_difference(first: Camera, second: Camera, distance_mm: float, *seen_px: Array) -> CameraDifference:
     """Compare two cameras of one picture size over points at a distance.
 
-    seen_px (N, 2): where corners were seen; the motion between the frames is fitted there (everywhere without). distance_mm: from the
-    camera to the points, infinity to allow a turn only. Raises CameraError for cameras of different pictures.
+    seen_px, each (N, 2): where corners were seen, for the first camera and for the second; the area that all of them cover is called
+    covered, and there the motion between the frames is fitted (everywhere without). distance_mm: from the camera to the points,
+    infinity to allow a turn only. Raises CameraError for cameras of different pictures.
     """
     if (first.width_px, first.height_px) != (second.width_px, second.height_px):
         raise CameraError(
@@ -84,7 +85,9 @@ def camera_difference(first: Camera, second: Camera, distance_mm: float, seen_px
             "both need pictures of one size"
         )
     pixels = picture_grid(first.width_px, first.height_px)
-    covered = np.ones(pixels.shape[:2], dtype=bool) if seen_px is None else covered_area(pixels, seen_px)
+    covered = np.ones(pixels.shape[:2], dtype=bool)
+    for seen in seen_px:
+        covered &= covered_area(pixels, seen)
     rays = first.unproject(pixels)
     near = np.isfinite(distance_mm)
     points = rays * (distance_mm / rays[..., 2:] if near else 1.0)
@@ -125,12 +128,8 @@ class Halves:
 
 
 def split_views(views: Sequence[BoardView]) -> tuple[list[BoardView], list[BoardView]]:
-    """Views in two halves that cover the picture alike: sorted along each axis in turn and dealt out."""
-    middle = np.array([view.pixels.mean(axis=0) for view in views])
-    spread = np.array([np.linalg.norm(np.ptp(view.pixels, axis=0)) for view in views])
-    # neighbours by place and size go to different halves
-    order = np.lexsort((middle[:, 0], spread.argsort().argsort() // 2))
-    return [views[i] for i in np.sort(order[::2])], [views[i] for i in np.sort(order[1::2])]
+    """Every other view: people change what they do along a series, and so both halves hold all of it."""
+    return list(views[::2]), list(views[1::2])
 
 
 def halves_of(calibration: Calibration) -> Halves | None:
@@ -147,11 +146,12 @@ def halves_of(calibration: Calibration) -> Halves | None:
         return None
     first, second = made[0].camera, made[1].camera
     distance = working_distance_mm(calibration)
-    seen = np.concatenate([view.pixels[used] for view, used in zip(calibration.views, calibration.used, strict=True)])
-    assert first.covariance is not None and second.covariance is not None
+    seen = [np.concatenate([view.pixels for view in half.views]) for half in made]
+    assert first.covariance is not None
+    assert second.covariance is not None
     sigma = np.sqrt(np.diag(first.covariance)[:2] + np.diag(second.covariance)[:2])
     apart = (second.focal_px - first.focal_px) / sigma
-    return Halves((first, second), camera_difference(first, second, distance, seen), distance, apart)
+    return Halves((first, second), camera_difference(first, second, distance, *seen), distance, apart)
 
 
 def working_distance_mm(calibration: Calibration) -> float:

@@ -15,12 +15,8 @@ from dishmap.camera.bundle import BoardCorners, Bundle, Prior
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# Along which coordinate of a pixel time runs.
-READING = ("columns", "rows")
 # A sheet on a plate bows by less than this part of its half side (sigma): 1 mm on a board of 200 mm.
 BEND_PART = 0.01
-# A board drifts by less than these while a picture is read (sigma): turn in rad, and shift as a part of its half side.
-DRIFT_RAD, DRIFT_PART = 0.02, 0.02
 # Centres of outlines follow the camera; this many rounds bring them to rest, or a change below this many px.
 MOST_ROUNDS, RESTING_PX = 6, 1e-6
 
@@ -30,8 +26,7 @@ class Problem:
     """Views of one board by one camera.
 
     middle_mm, half_mm: frame of the bends (`board_frame`); expected (P,): camera parameters that the prior is about;
-    flat: the board is taken as flat. reading: None for pictures that are taken at once; "rows" or "columns" for those that are read
-    one row (or column, where a picture was turned) after the other, with drift; size_px: along that side.
+    flat: the board is taken as flat.
     """
 
     views: tuple[BoardView, ...]
@@ -39,8 +34,6 @@ class Problem:
     half_mm: float
     expected: Array
     flat: bool = False
-    reading: str | None = None
-    size_px: float = 1.0
 
     def of_views(self, views: Sequence[BoardView]) -> Problem:
         """The same problem with other views."""
@@ -56,8 +49,7 @@ class Problem:
         bounds = np.cumsum([0, *(len(view.pixels) for view in self.views)])
         board = np.concatenate([view.board_mm for view in self.views])
         pixels = np.concatenate([view.pixels for view in self.views])
-        time = None if self.reading is None else pixels[:, READING.index(self.reading)] / self.size_px - 0.5
-        return BoardCorners(pixels, board, bounds, bends_of(board, self.middle_mm, self.half_mm), time)
+        return BoardCorners(pixels, board, bounds, bends_of(board, self.middle_mm, self.half_mm))
 
     def corners(self, bundle: Bundle) -> BoardCorners:
         """All corners; circles' outlines are replaced by the images of their centres, as this bundle sees the difference."""
@@ -65,7 +57,7 @@ class Problem:
         if not self.has_circles:
             return plain
         radius = np.concatenate([np.zeros(len(v.pixels)) if v.radius_mm is None else v.radius_mm for v in self.views])
-        points = bundle.seen(bundle.turned(plain), plain)
+        points = bundle.turned(plain) + bundle.translation_mm[plain.view]
         shift = outline_shift(bundle.camera, points, self._tangents(bundle, plain), radius)
         return replace(plain, pixels=plain.pixels - np.where(np.isfinite(shift), shift, 0.0))
 
@@ -93,8 +85,7 @@ class Problem:
         radius = float((np.linalg.norm(corners.pixels - camera.principal_px, axis=1) / camera.focal_px.min()).max())
         residuals = bundle.residuals(corners)
         noise = ba.scale_px(residuals if weights is None else residuals[weights > 0])
-        drift = np.concatenate([np.broadcast_to(DRIFT_RAD, 3), np.broadcast_to(DRIFT_PART, 3) * self.half_mm])
-        return Prior(self.expected, radius, noise, BEND_PART * self.half_mm, drift)
+        return Prior(self.expected, radius, noise, BEND_PART * self.half_mm)
 
     def solve(
         self, start: Bundle, weights: Array | None = None, free: Mask | None = None, robust: bool = False, prior: Prior | None = None

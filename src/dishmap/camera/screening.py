@@ -19,8 +19,9 @@ Mask = NDArray[np.bool_]
 FEWEST_VIEWS = 3
 # A view is left out when its rms is this many times the median view's, or when so many of its corners are outliers.
 BAD_VIEW_RATIO, BAD_VIEW_OUTLIERS = 4.0, 0.25
-# Beyond this many times the median view's rms a view is weighed down to what its own noise is worth.
-WEAK_VIEW_RATIO = 1.5
+# A view whose noise is over this many times that of the typical view is weighed down by the square of what is beyond. Views of one
+# noise scatter by some 8 % (54 corners), so they keep their weight.
+WEAK_VIEW_RATIO = 1.2
 # A corner is an outlier beyond this many robust sigmas of its own view: Gaussian noise gets there once in 6e7 corners.
 OUTLIER_SIGMAS = 6.0
 MOST_ROUNDS = 20

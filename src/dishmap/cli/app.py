@@ -18,6 +18,7 @@ from dishmap.cli.demo import demo_command
 from dishmap.cli.diff import diff_command
 from dishmap.cli.map import map_command
 from dishmap.cli.pattern import pattern_group
+from dishmap.cli.sheet import sheet_group
 from dishmap.cli.simulate import simulate_command
 from dishmap.cli.undistort import undistort_command
 from dishmap.errors import DishmapError
@@ -73,7 +74,16 @@ def program() -> None:
     """Measure the shape of a dish antenna, or of any printed surface, from photographs by one calibrated camera."""
 
 
-for _command in (pattern_group, calibrate_command, map_command, diff_command, simulate_command, undistort_command, demo_command):
+for _command in (
+    pattern_group,
+    sheet_group,
+    calibrate_command,
+    map_command,
+    diff_command,
+    simulate_command,
+    undistort_command,
+    demo_command,
+):
     program.add_command(_command)
 
 

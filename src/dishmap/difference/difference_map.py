@@ -70,7 +70,8 @@ class DifferenceMap:
     index, ids (N,); nominal_mm, normal (N, 3) in the dish frame. displacement_mm: total, along the nominal normal, positive towards
     the focus; depth_change_mm: total, along the camera's z; shape_mm: displacement with the best-fit rigid motion (or that of the rigid
     parts) removed; each with its standard deviation. du_dv_px (N, 2); misfit (N,): root of chi-square per degree of freedom of each target;
-    quality (N,). shape_factor (N, R) and shape_own_mm2 (N,): covariance of the shape is factor factor^T + diag(own).
+    quality (N,). shape_factor (N, R) and shape_own_mm2 (N,): covariance of the shape is factor factor^T + diag(own), and so for the
+    displacement.
     rigid_motion: dish_from_dish, of the surface in the reference's dish frame, and its covariance (6, 6) of (move mm, turn rad).
     expansion, focal_drift: (mean, sigma), per unit; expansion_assumed: its prior; learnt: names of the sizes learnt;
     noise_factor: variance of the residuals over the claimed one, by which sigmas were enlarged; zernike_terms (n, m), zernike_mm (T,)
@@ -90,6 +91,8 @@ class DifferenceMap:
     du_dv_px: Array
     misfit: Array
     quality: Index
+    displacement_factor: Array
+    displacement_own_mm2: Array
     shape_factor: Array
     shape_own_mm2: Array
     rigid_motion: Pose
@@ -330,6 +333,8 @@ def _assembled(
         quality=changes.quality
         | np.where(estimate.kept > 0, 0, int(Quality.OUTLIER))
         | np.where(estimate.loose, int(Quality.OFF_SURFACE), 0),
+        displacement_factor=mixed.factor[moved],
+        displacement_own_mm2=mixed.own[moved],
         shape_factor=mixed.factor[shape],
         shape_own_mm2=mixed.own[shape],
         rigid_motion=frame.motion(mixed.mean[rigid]),

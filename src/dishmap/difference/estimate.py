@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from dishmap.camera.model import Camera
 from dishmap.difference.changes import LEAST_TARGETS, TargetChanges
-from dishmap.difference.joint import RANGES, Evidence, Posterior, Sizes, determined, learn_sizes, misfit, posterior
+from dishmap.difference.joint import RANGES, Evidence, Posterior, Sizes, determined, learn_sizes, misfit, penalty, posterior
 from dishmap.difference.model import BLOCKS, WAYS, Columns, Surfaces, columns_of, curved_change, smooth_kernel, surfaces_of
 from dishmap.difference.priors import Priors
 from dishmap.errors import InputError, MeasurementError
@@ -37,9 +37,13 @@ PASSES = 3
 SCREEN = Sizes(normal_mm=1.0, slide_strain=1e-3, rough_mm=1.0, print_strain=1e-3)
 SCREEN_ROUNDS, SCREEN_STEP, SCREEN_RATIO, FIT_RATIO = 20, 4.0, 30.0, 5.0
 LIKE_MOST, USUAL_MISFIT = 0.75, 7.8
+# When more targets than this share would have to go, it is the surface that is strange, not they.
+LEAST_KEPT = 0.7
 OUTLIER_ROUNDS = 5
 # Residuals count as larger than claimed from this many standard deviations of their mean square; with this many degrees of freedom or more.
 NOTED_MISFIT, LEAST_FREEDOM, SETTLED_SCALE = 4.0, 12.0, 0.05
+# Sizes tried beside the learnt ones, as factors.
+SPREAD: tuple[dict[str, float], ...] = ({"normal_mm": 2.5}, {"rough_mm": 5.0}, {"rough_mm": 20.0}, {"normal_mm": 2.5, "rough_mm": 5.0})
 # Slide beyond what a way says, as a mean strain: more than this is another way of moving.
 LARGEST_SLIDE = 5e-6
 # How far the surface may have moved when its slides say nothing of it.
@@ -152,13 +156,13 @@ class _Problem:
         """
         columns = self.columns("any", LENGTHS[0] * self.surfaces.fields.radius_mm)
         wide = replace(SCREEN, expansion=self.expansion[1], focal=self.priors.focal_drift)
-        found, limit = posterior(self.evidence(columns), wide), np.inf
+        found, limit, floor = posterior(self.evidence(columns), wide), np.inf, SCREEN_RATIO * USUAL_MISFIT
         for _ in range(SCREEN_ROUNDS):
             values = misfit(self.evidence(columns, found, everything=True), found)
-            final = SCREEN_RATIO * _like_most(values)
-            limit = max(min(limit / SCREEN_STEP, float(values.max()) / SCREEN_STEP), final)
+            # outliers spoil the fit to all, so what most targets show is no guide before they are gone
+            limit = max(min(limit, float(values.max())) / SCREEN_STEP, floor)
             kept = np.where(values < limit, 1.0, 0.0)
-            if limit == final and np.array_equal(kept, self.kept):
+            if kept.mean() < LEAST_KEPT or (limit == floor and np.array_equal(kept, self.kept)):
                 break
             self.kept = kept
             found = posterior(self.evidence(columns, found), wide)
@@ -208,6 +212,8 @@ class _Problem:
             tell(len(ways) + lengths.index(length) + 1, total)
         every = _finite(every)
         top = max(h.log_weight for h in every)
+        every = self._spread([h for h in every if h.log_weight > top - LEAST_LOG_WEIGHT])
+        top = max(h.log_weight for h in every)
         every = [h for h in every if h.log_weight > top - LEAST_LOG_WEIGHT]
         weights = np.exp([h.log_weight - top for h in every])
         one = max(every, key=lambda h: h.log_weight)
@@ -223,6 +229,21 @@ class _Problem:
             parts_named=bool(self.priors.rigid_ids),
             surfaces=self.surfaces,
         )
+
+    def _spread(self, every: list[Hypothesis]) -> list[Hypothesis]:
+        """The hypotheses, and the same with larger sizes: a size learnt from little is not known, and too small a one is overconfident."""
+        out = list(every)
+        for h in every:
+            for changes in SPREAD:
+                known = {
+                    name: factor for name, factor in changes.items() if name in self.learnt and not (h.way == "any" and name == "normal_mm")
+                }
+                if len(known) < len(changes):
+                    continue
+                sizes = replace(h.posterior.sizes, **{n: getattr(h.posterior.sizes, n) * f for n, f in known.items()})
+                found = posterior(self.evidence(h.columns, h.posterior), sizes)
+                out.append(replace(h, posterior=found, log_weight=found.log_evidence - penalty(sizes, self.learnt)))
+        return out
 
     def _without_outliers(self, every: list[Hypothesis], length: float) -> list[Hypothesis]:
         """Put targets aside that do not fit the best hypothesis, and enlarge the noise where the rest do not fit as claimed."""

@@ -228,8 +228,12 @@ def learn_sizes(
         settled = abs(found.log_evidence - before.log_evidence) < SETTLED_NATS and _moved(before, found) < SETTLED_SIGMAS
         if settled or not np.isfinite(found.log_evidence):
             break
-    penalty = sum(0.5 * (np.log(getattr(found.sizes, n) / RANGES[n][0]) / PRIOR_FOLDS) ** 2 for n in names)
-    return Learnt(found, found.log_evidence - float(penalty), settled)
+    return Learnt(found, found.log_evidence - penalty(found.sizes, names), settled)
+
+
+def penalty(sizes: Sizes, names: Sequence[str]) -> float:
+    """What the broad log-normal prior of the learnt sizes takes off the log evidence."""
+    return float(sum(0.5 * (np.log(getattr(sizes, n) / RANGES[n][0]) / PRIOR_FOLDS) ** 2 for n in names))
 
 
 def _clipped(name: str, value: float, largest: Mapping[str, float]) -> float:

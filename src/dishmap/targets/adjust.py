@@ -166,7 +166,7 @@ def _one_step(batch: Batch, pixels: RingPixels, poses: Poses, state: State, weig
     converged = ((sigmas * left < STEP_SIGMAS) & (move_px < SETTLED_PX)) | (move_px < STEP_PX)
     turn = np.linalg.norm(delta[:, 3:6], axis=1)
     limit = np.minimum(1.0, np.minimum(LARGEST_STEP_PX / np.maximum(move_px, 1e-9), LARGEST_TURN_RAD / np.maximum(turn, 1e-9)))
-    poses, state = _moved(poses, state, delta * np.nan_to_num(limit)[:, None])
+    poses, state = moved_by(poses, state, delta * np.nan_to_num(limit)[:, None])
     good = converged & np.isfinite(poses.position_mm).all(axis=1) & np.isfinite(information).all(axis=(1, 2))
     turning = float(np.nan_to_num(turn).max(initial=0.0)) > NEW_FIELDS_RAD
     return Adjusted(poses, state, information, data, good, sums, residual, variance), turning
@@ -208,7 +208,7 @@ def with_other_priors(fit: Adjusted, before: Priors, after: Priors) -> tuple[Pos
     delta = solve_scaled(information, new - old)
     # targets that did not converge, or would go far, stay where they are
     delta *= (np.abs(delta[:, 3:6]).max(axis=1) < LARGEST_TURN_RAD)[:, None] & fit.converged[:, None]
-    return _moved(fit.poses, fit.state, delta)
+    return moved_by(fit.poses, fit.state, delta)
 
 
 def _largest_motion_px(delta: Array, maps: LocalMaps, target: NDArray[np.int64], count: int) -> Array:
@@ -220,7 +220,8 @@ def _largest_motion_px(delta: Array, maps: LocalMaps, target: NDArray[np.int64],
     return np.asarray(out + np.abs(delta[:, OFFSET_PX]) + np.abs(delta[:, BLUR]))
 
 
-def _moved(poses: Poses, state: State, delta: Array) -> tuple[Poses, State]:
+def moved_by(poses: Poses, state: State, delta: Array) -> tuple[Poses, State]:
+    """Poses and state after a step (T, G) of all geometry parameters; blur and tone curve stay within reason."""
     position = poses.position_mm + np.einsum("tij,tj->ti", poses.steps, delta[:, :3])
     rotation = poses.rotation @ rotation_from_vector(delta[:, 3:6])
     blur = np.clip(state.blur_px * np.exp(np.clip(delta[:, BLUR] / state.blur_px, -0.5, 0.5)), SHARPEST_BLUR_PX, WIDEST_BLUR_PX)

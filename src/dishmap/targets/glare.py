@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri
 
-from dishmap.targets.adjust import LARGEST_TURN_RAD, Adjusted, Batch, by_target, prior_terms
+from dishmap.targets.adjust import LARGEST_TURN_RAD, Adjusted, Batch, by_target, moved_by, prior_terms
 from dishmap.targets.edges import Poses, monomials
 from dishmap.targets.light import GROUND, INK, LIGHT, TONE_RATIOS, light_columns, ridge, toned
-from dishmap.targets.pixels import BLUR, GEOMETRY, OFFSET_MM, OFFSET_PX, TONE, RingPixels, State, coverage_columns
+from dishmap.targets.pixels import GEOMETRY, TONE, RingPixels, State, coverage_columns
 from dishmap.targets.scene_noise import NoiseModel
 from dishmap.targets.solve import solve_each, solve_scaled
-from dishmap.transforms import rotation_from_vector
 
 Array = NDArray[Any]
 Bool = NDArray[Any]
@@ -114,16 +113,8 @@ def _fitted(
         information = data + precision[:, :, None] * np.eye(GEOMETRY)
         delta = solve_scaled(information, by_target(right, own.target, len(few)) / variance[:, None] + pull)
         delta *= np.minimum(1.0, LARGEST_TURN_RAD / np.maximum(np.abs(delta[:, 3:6]).max(axis=1), 1e-12))[:, None]
-        poses, state = _moved(poses, state, delta)
+        poses, state = moved_by(poses, state, delta)
     return poses, state, data, information
-
-
-def _moved(poses: Poses, state: State, delta: Array) -> tuple[Poses, State]:
-    """Poses and state after a step (T, G) of all geometry parameters."""
-    position = poses.position_mm + np.einsum("tij,tj->ti", poses.steps, delta[:, :3])
-    blur = np.maximum(state.blur_px + delta[:, BLUR], 0.5 * state.blur_px)
-    nuisances = State(state.offset_mm + delta[:, OFFSET_MM], state.offset_px + delta[:, OFFSET_PX], blur, state.log_gamma + delta[:, TONE])
-    return Poses(poses.rotation @ rotation_from_vector(delta[:, 3:6]), position), nuisances
 
 
 def _without_curved_light(

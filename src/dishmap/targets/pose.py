@@ -20,15 +20,17 @@ from dishmap.quality import Quality, is_rejected, names
 from dishmap.targets.adjust import Adjusted, Priors, by_target, prior_terms
 from dishmap.targets.detect import Detections
 from dishmap.targets.identify import Identity
+from dishmap.targets.neighbours import Ink
 from dishmap.targets.pattern import Pattern
 from dishmap.targets.pixels import BLUR, GEOMETRY, OFFSET_MM, OFFSET_PX, TONE, RingPixels
-from dishmap.targets.scene_noise import NoiseModel, noise_model
+from dishmap.targets.scene_noise import NoiseModel, inflation_of
 from dishmap.targets.sensitivity import calibration_jacobian
 from dishmap.targets.settle import with_clear_light, with_learnt_normals, with_likelier_normals
 from dishmap.targets.solve import inverse_scaled, solve_each
 from dishmap.targets.stages import (
     OCCLUDED_BELOW,
     Assumptions,
+    Coarse,
     Fit,
     Group,
     Shared,
@@ -38,6 +40,7 @@ from dishmap.targets.stages import (
     printed_ink,
     regroup,
     start_groups,
+    wholly_inside,
 )
 from dishmap.targets.start import centers_of
 from dishmap.transforms import Pose
@@ -46,10 +49,14 @@ Array = NDArray[Any]
 Index = NDArray[np.int64]
 
 SMALLEST_RADIUS_PX = 2.0
+# Sums of squares of larger grey levels leave the range of single precision.
+LARGEST_GREY = 1e15
 # Share of an edge that must be left for a target to be measured.
 HIDDEN_BELOW = 0.5
-# Residual variance over the photograph's noise at which the model is said not to fit, and the least contrast in sigmas.
-POOR_FIT_RATIO, LEAST_CONTRAST_SIGMAS = 2.5, 4.0
+# Residual variance over the photograph's noise at which the model is said not to fit.
+POOR_FIT_RATIO = 2.5
+# The least contrast in sigmas, and as a part of the ground's light.
+LEAST_CONTRAST_SIGMAS, LEAST_CONTRAST_PART = 4.0, 0.01
 # Pixels over which misfit is coherent (2 sqrt(pi) blurs squared, for a sharp image), and the allowance for a hidden edge.
 COHERENT_PIXELS, OBSTACLE_ALLOWANCE = 9.0, 30.0
 # Share of a ring's pixels at the end of the scale from which glare is said.
@@ -120,7 +127,8 @@ def measure_targets(
     """
     check_image(image, camera)
     # thousands of small matrix products: threads would cost more than they bring, far more on a busy machine
-    with threadpool_limits(limits=1, user_api="blas"):
+    # what overflows belongs to a target that the fit left, which is then rejected
+    with threadpool_limits(limits=1, user_api="blas"), np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         return _measure(image, camera, pattern, detections, identity, assumptions or Assumptions(), progress or (lambda done, total: None))
 
 
@@ -138,14 +146,8 @@ def _measure(
     coarse = []
     ink = printed_ink(camera, pattern, groups, identity.camera_from_dish)
     for group in groups:
-        fit = coarse_fit(image, group, ink)
-        if not np.isfinite(fit.adjusted.poses.position_mm).all():
-            good = np.asarray(np.isfinite(fit.adjusted.poses.position_mm).all(axis=1))
-            rejected += [(int(pattern.ids[i]), "its pixels do not look like the printed target") for i in group.index[~good]]
-            if not good.any():
-                continue
-            fit = coarse_fit(image, regroup(group, good), ink)
-        coarse.append(fit)
+        fit = _coarse_fit(image, pattern, group, ink, rejected)
+        coarse += [] if fit is None else [fit]
         tell(len(coarse), total)
     if not coarse:
         raise MeasurementError(
@@ -160,6 +162,21 @@ def _measure(
     return _collect(image, pattern, fits, shared, assumptions, rejected)
 
 
+def _coarse_fit(image: NDArray[Any], pattern: Pattern, group: Group, ink: Ink, rejected: list[tuple[int, str]]) -> Coarse | None:
+    """Coarse fit of the targets that it does not lead astray; the others are added to `rejected`. None if none is left.
+
+    They are taken out at once, because one that seems huge would spoil the windows of all others, which share one size.
+    """
+    while len(group.index):
+        fit = coarse_fit(image, group, ink)
+        good = np.isfinite(fit.adjusted.poses.position_mm).all(axis=1) & wholly_inside(fit.group)
+        if good.all():
+            return fit
+        rejected += [(int(pattern.ids[i]), "its pixels do not look like the printed target") for i in group.index[~good]]
+        group = regroup(group, good)
+    return None
+
+
 def check_image(image: NDArray[Any], camera: Camera) -> None:
     """Raise ImageError or CameraError unless `image` is a grey picture of the camera's size without NaN."""
     if image.ndim != 2 or not image.size:
@@ -172,6 +189,10 @@ def check_image(image: NDArray[Any], camera: Camera) -> None:
         )
     if image.dtype.kind == "f" and not np.isfinite(image).all():
         raise ImageError("the image holds NaN or infinite pixels; give finite grey levels")
+    if image.dtype.itemsize > 4 or image.dtype.kind == "f":
+        largest = max(abs(float(image.max())), abs(float(image.min())))
+        if largest > LARGEST_GREY:
+            raise ImageError(f"the image holds a grey level of {largest:.3g}; scale them to 0 to 255 for black to white")
 
 
 def _collect(
@@ -182,9 +203,8 @@ def _collect(
     assumptions: Assumptions,
     rejected: list[tuple[int, str]],
 ) -> TargetPoses:
-    blocks = [p.shape is None for _, _, p in fits]
-    pooled = noise_model([p.grey for _, _, p in fits], [a.residual for _, a, _ in fits], [p.used for _, _, p in fits], blocks)
-    noise = replace(shared.noise, inflation=pooled.inflation)
+    blocks = [(a.residual, p.used) for _, a, p in fits if p.shape is None]
+    noise = replace(shared.noise, inflation=inflation_of([r for r, _ in blocks], [u for _, u in blocks]))
     if assumptions.normal_sigma_deg is None:
         fits, shared = with_learnt_normals(fits, shared, noise.inflation)
     fits = with_clear_light(with_likelier_normals(fits, noise), noise)
@@ -244,7 +264,7 @@ def _results(image: NDArray[Any], group: Group, adjusted: Adjusted, pixels: Ring
         "kept": kept,
     }
     columns["information"], columns["pull"], columns["prior"] = _likelihood(batch.priors, adjusted, turned, noise.inflation * allowance)
-    columns["quality"] = _quality(image, group, adjusted, pixels, columns, data + prior)
+    columns["quality"] = _quality(image, group, adjusted, pixels, columns, data + prior, light[:, 0])
     return columns
 
 
@@ -296,6 +316,7 @@ def _quality(
     pixels: RingPixels,
     columns: dict[str, Array],
     information: Array,
+    ground: Array,
 ) -> Index:
     count = len(group.index)
     bits = np.zeros(count, np.int64)
@@ -309,7 +330,8 @@ def _quality(
     known += [columns[name].reshape(count, -1) for name in ("information", "pull", "prior", "calibration_jacobian")]
     finite = np.isfinite(np.concatenate(known, axis=1)).all(axis=1)
     flag(~(adjusted.converged & finite), Quality.NOT_CONVERGED)
-    flag(columns["contrast"] < LEAST_CONTRAST_SIGMAS * columns["noise"], Quality.NO_CONTRAST)
+    least = np.maximum(LEAST_CONTRAST_SIGMAS * columns["noise"], LEAST_CONTRAST_PART * ground)
+    flag(columns["contrast"] < least, Quality.NO_CONTRAST)
     flag(adjusted.noise_variance > POOR_FIT_RATIO, Quality.POOR_FIT)
     across = np.linalg.norm(outlines - outlines.mean(axis=2, keepdims=True), axis=3).min(axis=2)
     flag((across < SMALLEST_RADIUS_PX).any(axis=1), Quality.TOO_SMALL)

@@ -14,6 +14,8 @@ from dishmap.targets.solve import inverse_each, inverse_scaled
 Array = NDArray[Any]
 
 LEVELS = 12
+# So many pixels are enough: they give a sigma to half a percent.
+NOISE_PIXELS = 30000
 # Grey levels between which the variance must differ clearly before a slope is used (2 = photon noise over 4:1 in light).
 LEAST_RATIO = 1.3
 ROBUST_TO_SIGMA = 1.4826
@@ -42,17 +44,28 @@ class NoiseModel:
         return np.maximum(self.base + self.slope * np.maximum(grey, 0), 1e-6)
 
 
-def noise_model(grey: list[Array], residual: list[Array], used: list[NDArray[Any]], blocks: list[bool]) -> NoiseModel:
-    """Fit the noise model to residuals of rings (M, n); `blocks`: pixels come in 2x2 blocks of neighbours (see window)."""
-    values = np.concatenate([(g - r)[u] for g, r, u in zip(grey, residual, used, strict=True)])
-    errors = np.concatenate([r[u] for r, u in zip(residual, used, strict=True)])
-    keep = slice(None, None, max(1, len(values) // 60000))
-    base, slope = _variance_line(values[keep], errors[keep])
-    pairs = [_correlations(r, u) for r, u, b in zip(residual, used, blocks, strict=True) if b]
-    return NoiseModel(base, slope, _inflation(pairs))
+def noise_model(grey: list[Array], residual: list[Array], used: list[NDArray[Any]]) -> NoiseModel:
+    """Fit the noise model to residuals of rings (M, n), as if noise were white: see `inflation_of`."""
+    step = _odd_step(sum(g.size for g in grey), NOISE_PIXELS)
+    kept = [(g.ravel()[::step], r.ravel()[::step], u.ravel()[::step]) for g, r, u in zip(grey, residual, used, strict=True)]
+    kept = [(g, r, u & np.isfinite(r)) for g, r, u in kept]
+    base, slope = _variance_line(np.concatenate([(g - r)[u] for g, r, u in kept]), np.concatenate([r[u] for _, r, u in kept]))
+    return NoiseModel(base, slope, 1.0)
+
+
+def _odd_step(size: int, most: int) -> int:
+    """Every so many of `size` pixels are `most` or a few more; odd, as pixels come in blocks of four."""
+    return max(1, size // most) | 1 if size > 2 * most else 1
+
+
+def inflation_of(residual: list[Array], used: list[NDArray[Any]]) -> float:
+    """Inflation of `NoiseModel` from residuals of rings (M, n) whose pixels come in 2x2 blocks of neighbours (see window)."""
+    return _inflation([_correlations(r, u) for r, u in zip(residual, used, strict=True)])
 
 
 def _variance_line(values: Array, errors: Array) -> tuple[float, float]:
+    if not len(values):
+        return 1.0, 0.0
     edges = np.quantile(values, np.linspace(0, 1, LEVELS + 1))
     which = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, LEVELS - 1)
     level, variance = [], []
@@ -76,7 +89,9 @@ def _variance_line(values: Array, errors: Array) -> tuple[float, float]:
 
 def _correlations(residual: Array, used: NDArray[Any]) -> tuple[float, float, float]:
     """Correlation of residuals between horizontal, vertical and diagonal neighbours within blocks of 2x2."""
-    scale = ROBUST_TO_SIGMA * np.median(np.abs(residual[used])) if used.any() else 1.0
+    step = _odd_step(residual.size, NOISE_PIXELS)
+    some = np.abs(residual.ravel()[::step][used.ravel()[::step]])
+    scale = ROBUST_TO_SIGMA * np.median(some) if len(some) else 1.0
     clipped = np.where(used & (np.abs(residual) < 4 * scale), residual, 0.0).reshape(len(residual), -1, 4)
     whole = (clipped != 0).all(axis=2)
     r = clipped[whole]

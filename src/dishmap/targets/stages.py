@@ -146,9 +146,9 @@ def start_groups(
         order = np.argsort(np.linalg.norm(poses.position_mm, axis=1), kind="stable")
         for part in np.array_split(order, -(-len(order) // GROUP_SIZE)):
             group = _first_group(camera, pattern, kind, index[part], poses.take(part), assumptions)
-            expected = _wholly_inside(group)
+            expected = wholly_inside(group)
             group = _on_ellipses(group, pattern, detections, identity)
-            inside = _wholly_inside(group)
+            inside = wholly_inside(group)
             for i, there in zip(group.index[~inside], expected[~inside], strict=True):
                 rejected.append(
                     (int(pattern.ids[i]), "too little of it was seen to find its place" if there else "it reaches beyond the image")
@@ -169,7 +169,8 @@ def printed_ink(camera: Camera, pattern: Pattern, groups: list[Group], camera_fr
     return ink_of(camera, pattern, parts)
 
 
-def _wholly_inside(group: Group) -> Bool:
+def wholly_inside(group: Group) -> Bool:
+    """Where (T,) all of a target lies inside the image."""
     return np.asarray(group.batch.camera.contains(group.outlines(), margin_px=1.0).all(axis=(1, 2)))
 
 
@@ -286,9 +287,7 @@ def learn(camera: Camera, pattern: Pattern, start: Pose, coarse: list[Coarse], a
     centers = np.concatenate([centers_of(camera, c.group.poses, c.group.batch.curvature_per_mm)[0] for c in coarse])
     good = np.isfinite(centers).all(axis=1)
     pose = rigid_pose(pattern, index[good], camera, centers[good], start) if good.sum() >= 4 else start
-    noise = noise_model(
-        [c.pixels.grey for c in coarse], [c.adjusted.residual for c in coarse], [c.pixels.used for c in coarse], [False] * len(coarse)
-    )
+    noise = noise_model([c.pixels.grey for c in coarse], [c.adjusted.residual for c in coarse], [c.pixels.used for c in coarse])
     shares = np.concatenate([c.cut / np.maximum(ring_contrast(c.adjusted), 1.0) for c in coarse])
     rest = (*shared_tone(coarse), float(np.median(shares)))
     if assumptions.normal_sigma_deg is not None:

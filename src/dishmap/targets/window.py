@@ -18,8 +18,9 @@ Index = NDArray[np.int64]
 OUTLINE_POINTS = 16
 # The blur of one ring must not reach the next: this many blurs of ground between them, else they are modelled together.
 RING_GAP_BLURS = 5.0
-# A ring's window is at most this wide; larger targets use fewer of their pixels (every k-th).
-LARGEST_WINDOW_PX = 400
+# A ring's window is at most this wide; larger targets use fewer of their pixels (every k-th). Rings that need the fine grid are
+# smaller by their nature, unless a fit has gone astray.
+LARGEST_WINDOW_PX, LARGEST_FINE_PX = 400, 200
 
 
 def outline(camera: Camera, poses: Poses, curvature_per_mm: Array, center_mm: Array, radius_mm: Array) -> Array:
@@ -89,7 +90,7 @@ def ring_pixels(
     ring = np.tile(np.arange(len(rings)), len(patches.target) // len(rings))
     half = np.ceil(half_px + reach + 1)
     if fine:
-        return _whole_windows(image, rings, maps, patches, ring, int(half.max()), reach)
+        return _whole_windows(image, rings, maps, patches, ring, min(int(half.max()), LARGEST_FINE_PX // 2), reach)
     return _bands(image, rings, maps, patches, ring, half, reach)
 
 

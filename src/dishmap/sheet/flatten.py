@@ -1,0 +1,197 @@
+"""Maps between a surface and the flat paper that is laid on it.
+
+No piece of a paraboloid is flat, so paper laid on it must give somewhere. Both maps keep all lengths away from one line or point, and
+lengths across those ways are longer on the paper than on the surface by a little: the paper must shrink there. `stretch` says by how much.
+
+- `AroundVertex`: lengths along the meridians are true, those along the parallels are r / s of the paper's (r: distance from the axis,
+  s: from the vertex along the surface).
+- `AlongMeridian`: lengths along a meridian are true, and so are those along the geodesics that leave it at right angles (Fermi
+  coordinates; do Carmo, Differential Geometry, 4.6). Across these, the ratio follows Jacobi's equation j'' = -K j, about 1 - K t^2 / 2 at a
+  distance t, with Gauss's curvature K.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dishmap.targets.pattern import Surface
+
+Array = NDArray[np.float64]
+
+# Runge-Kutta steps along a geodesic: 1e-9 mm over 200 mm on a dish of 300 mm focal length.
+STEPS = 24
+# Newton steps for the way back; six are enough for rounding.
+NEWTON_STEPS = 12
+NEWTON_MM = 1e-11
+
+
+class FlatMap(Protocol):
+    """A map between positions on a surface, seen along its axis (N, 2), and positions on flat paper (N, 2), both in mm."""
+
+    def to_flat(self, xy_mm: Array) -> Array:
+        """Where points of the surface lie on the paper."""
+
+    def to_surface(self, flat_mm: Array) -> Array:
+        """Where points of the paper lie on the surface."""
+
+    def axes(self, flat_mm: Array) -> tuple[Array, Array]:
+        """Unit vectors (N, 3) along the surface into which the paper's x and y go."""
+
+    def stretch(self, flat_mm: Array, reach_mm: Array) -> Array:
+        """Length on the surface over length on the paper (N,): the one farthest from 1 within reach_mm (N,) of each point."""
+
+
+@dataclass(frozen=True)
+class Flat:
+    """A plane: nothing changes."""
+
+    def to_flat(self, xy_mm: Array) -> Array:
+        """The same points."""
+        return np.asarray(xy_mm, dtype=float)
+
+    to_surface = to_flat
+
+    def axes(self, flat_mm: Array) -> tuple[Array, Array]:
+        """The x and y axes."""
+        x, y = (np.tile(row, (len(flat_mm), 1)) for row in np.eye(3)[:2])
+        return x, y
+
+    def stretch(self, flat_mm: Array, reach_mm: Array) -> Array:
+        """One everywhere."""
+        return np.ones(len(flat_mm))
+
+
+@dataclass(frozen=True)
+class AroundVertex:
+    """A paraboloid flattened about its vertex; the paper's x and y are the dish's."""
+
+    focal_length_mm: float
+
+    def to_flat(self, xy_mm: Array) -> Array:
+        """Where points of the surface lie on the paper."""
+        radius = np.hypot(*np.asarray(xy_mm, dtype=float).T)
+        return np.asarray(xy_mm * _over(meridian_mm(radius, self.focal_length_mm), radius)[:, None])
+
+    def to_surface(self, flat_mm: Array) -> Array:
+        """Where points of the paper lie on the surface."""
+        way = np.hypot(*np.asarray(flat_mm, dtype=float).T)
+        return np.asarray(flat_mm * _over(radius_mm(way, self.focal_length_mm), way)[:, None])
+
+    def axes(self, flat_mm: Array) -> tuple[Array, Array]:
+        """Unit vectors (N, 3) along the surface into which the paper's x and y go."""
+        way = np.hypot(*flat_mm.T)
+        c, s = (np.where(way > 0, flat_mm[:, k] / np.where(way > 0, way, 1.0), 1.0 - k) for k in (0, 1))
+        slope = radius_mm(way, self.focal_length_mm) / (2 * self.focal_length_mm)
+        outward = np.column_stack([c, s, slope]) / np.hypot(1, slope)[:, None]
+        around = np.column_stack([-s, c, np.zeros_like(c)])
+        return c[:, None] * outward - s[:, None] * around, s[:, None] * outward + c[:, None] * around
+
+    def stretch(self, flat_mm: Array, reach_mm: Array) -> Array:
+        """Length along the parallel over length on the paper (N,), where it is least."""
+        way = np.hypot(*flat_mm.T) + reach_mm
+        return _over(radius_mm(way, self.focal_length_mm), way)
+
+
+@dataclass(frozen=True)
+class AlongMeridian:
+    """A paraboloid flattened about the meridian at an azimuth: the paper's y is the way along it from the vertex.
+
+    The printed side faces the focus, so the paper's x runs against the azimuth.
+    """
+
+    focal_length_mm: float
+    azimuth_rad: float
+
+    def to_flat(self, xy_mm: Array) -> Array:
+        """Where points of the surface lie on the paper, by Newton's method on `to_surface`."""
+        xy = np.asarray(xy_mm, dtype=float)
+        point = np.column_stack([xy, (xy**2).sum(axis=1) / (4 * self.focal_length_mm)])
+        radius, turn = np.hypot(*xy.T), np.arctan2(xy[:, 1], xy[:, 0]) - self.azimuth_rad
+        way = meridian_mm(radius, self.focal_length_mm)
+        flat = np.column_stack([-way * np.sin(turn), way * np.cos(turn)])
+        for _ in range(NEWTON_STEPS):
+            at, along, across, ratio = self._walk(flat)
+            step = np.column_stack([((point - at) * along).sum(axis=1), ((point - at) * across).sum(axis=1) / ratio])
+            flat = flat + step
+            if np.abs(step).max(initial=0.0) < NEWTON_MM:
+                break
+        return flat
+
+    def to_surface(self, flat_mm: Array) -> Array:
+        """Where points of the paper lie on the surface."""
+        return self._walk(np.asarray(flat_mm, dtype=float))[0][:, :2]
+
+    def axes(self, flat_mm: Array) -> tuple[Array, Array]:
+        """Unit vectors (N, 3) along the surface into which the paper's x and y go."""
+        _, along, across, _ = self._walk(flat_mm)
+        return along, across
+
+    def stretch(self, flat_mm: Array, reach_mm: Array) -> Array:
+        """Length along the meridian over length on the paper (N,), where it is least."""
+        farthest = flat_mm[:, 0] + np.copysign(reach_mm, flat_mm[:, 0])
+        return self._walk(np.column_stack([farthest, flat_mm[:, 1]]))[3]
+
+    def _walk(self, flat_mm: Array) -> tuple[Array, Array, Array, Array]:
+        """From the meridian along the geodesic: points (N, 3), directions along it and across it, and Jacobi's ratio (N,)."""
+        f = self.focal_length_mm
+        radius = radius_mm(flat_mm[:, 1], f)
+        c, s = np.cos(self.azimuth_rad), np.sin(self.azimuth_rad)
+        point = np.column_stack([radius * c, radius * s, radius**2 / (4 * f)])
+        outward = np.column_stack([np.full_like(radius, c), np.full_like(radius, s), radius / (2 * f)])
+        outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+        state = np.column_stack([point, np.cross(outward, _normal(point, f)), np.ones_like(radius), np.zeros_like(radius)])
+        h = flat_mm[:, :1] / STEPS
+        for _ in range(STEPS):
+            k1 = _change(state, f)
+            k2 = _change(state + h / 2 * k1, f)
+            k3 = _change(state + h / 2 * k2, f)
+            state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + _change(state + h * k3, f))
+        return state[:, :3], state[:, 3:6], np.cross(_normal(state[:, :3], f), state[:, 3:6]), state[:, 6]
+
+
+def flat_map(surface: Surface) -> Flat | AroundVertex:
+    """The map for a whole surface: none for a plane, about the vertex for a paraboloid."""
+    if surface.focal_length_mm is None or surface.kind == "plane":
+        return Flat()
+    return AroundVertex(surface.focal_length_mm)
+
+
+def meridian_mm(radius: Array, focal_length_mm: float) -> Array:
+    """Way along a meridian of a paraboloid from the vertex to a distance from the axis (N,), both in mm."""
+    x = np.asarray(radius, dtype=float) / (2 * focal_length_mm)
+    return np.asarray(focal_length_mm * (x * np.hypot(1, x) + np.arcsinh(x)))
+
+
+def radius_mm(way: Array, focal_length_mm: float) -> Array:
+    """Distance from the axis at a way along a meridian from the vertex (N,), both in mm: the inverse of `meridian_mm`."""
+    way = np.asarray(way, dtype=float)
+    radius = way / np.sqrt(1 + np.abs(way) / (4 * focal_length_mm))
+    for _ in range(NEWTON_STEPS):
+        step = (way - meridian_mm(radius, focal_length_mm)) / np.hypot(1, radius / (2 * focal_length_mm))
+        radius = radius + step
+        if np.abs(step).max(initial=0.0) < NEWTON_MM:
+            break
+    return radius
+
+
+def _change(state: Array, f: float) -> Array:
+    """Derivative of (point, direction, j, j') along a geodesic: it bends with the surface only, p'' = II(p', p') n."""
+    point, direction, ratio, slope = state[:, :3], state[:, 3:6], state[:, 6], state[:, 7]
+    steep = 1 + (point[:, :2] ** 2).sum(axis=1) / (4 * f**2)
+    bend = (direction[:, :2] ** 2).sum(axis=1) / (2 * f) / np.sqrt(steep)
+    gauss = 1 / (4 * f**2) / steep**2
+    return np.column_stack([direction, bend[:, None] * _normal(point, f), slope, -gauss * ratio])
+
+
+def _normal(point: Array, f: float) -> Array:
+    normal = np.column_stack([-point[:, :2] / (2 * f), np.ones(len(point))])
+    return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+
+
+def _over(a: Array, b: Array) -> Array:
+    """The ratio of two lengths, and 1 where both vanish."""
+    return np.asarray(np.where(b > 0, a / np.where(b > 0, b, 1.0), 1.0))

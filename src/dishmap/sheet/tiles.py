@@ -1,0 +1,148 @@
+"""Large pieces cut into tiles that fit the paper: where the cuts go, so that none crosses a target if that can be avoided."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dishmap.errors import InputError
+from dishmap.sheet.paper import words_of
+from dishmap.sheet.pieces import TAB_MM, Piece
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+# Each tile is printed beyond its cuts by this, to be glued under its neighbour, unless another overlap is given.
+OVERLAP_MM = 10.0
+# Free paper between a cut and the ink.
+CLEARANCE_MM = 0.3
+# A cut that avoids the ink makes a tile smaller, but not by more than this part.
+SMALLEST_PART = 0.4
+# More sheets than this are a mistake in the units.
+LARGEST_PAGES = 400
+# Crosses on the cuts, which both neighbours show, lie this far apart or more, with arms of this length.
+CROSS_STEP_MM, CROSS_ARM_MM = 40.0, 2.5
+
+
+@dataclass(frozen=True)
+class Tile:
+    """Part of a piece: own (n,) which of its targets; the box between the cuts and what is printed of it; row, column from the lower left.
+
+    crossing (n,): which of the own targets reach over a cut, and so need a tab.
+    """
+
+    row: int
+    column: int
+    own: Index
+    crossing: Index
+    cut_low: Array
+    cut_high: Array
+    low: Array
+    high: Array
+
+
+def tiles_of(piece: Piece, room_mm: Array, overlap_mm: float = OVERLAP_MM) -> tuple[list[Tile], Array]:
+    """Tiles of a piece that fit room_mm (2,), and the places (c, 2) of the crosses that neighbours share.
+
+    Raises InputError when the paper is smaller than a target, or when too many sheets would be needed.
+    """
+    reach = float(piece.keep_mm[:, 2].max(initial=0.0))
+    if 2 * reach > room_mm.min():
+        raise InputError(
+            f"a target of {2 * reach:.4g} mm does not fit on the {words_of(room_mm)} mm that the paper has room for; take larger paper"
+        )
+    _check_count(piece, room_mm, overlap_mm)
+    cuts = [_cuts(piece, axis, float(room_mm[axis]), overlap_mm) for axis in (0, 1)]
+    edges = [[piece.low_mm[k], *cuts[k][0], piece.high_mm[k]] for k in (0, 1)]
+    grow = [cuts[k][1] for k in (0, 1)]
+    tiles = []
+    for row, (bottom, top) in enumerate(pairwise(edges[1])):
+        for column, (left, right) in enumerate(pairwise(edges[0])):
+            tiles.append(_tile(piece, row, column, np.array([left, bottom]), np.array([right, top]), np.array(grow)))
+    return [tile for tile in tiles if len(tile.own) or not len(piece.keep_mm)], _crosses(piece, edges)
+
+
+def _check_count(piece: Piece, room: Array, overlap: float) -> None:
+    if (room <= 2 * overlap).any():
+        raise InputError(f"an overlap of {overlap:g} mm leaves nothing of the {words_of(room)} mm that the paper has room for")
+    count = float(np.prod(np.maximum(1, np.floor((piece.high_mm - piece.low_mm) / room))))
+    if count > LARGEST_PAGES:
+        raise InputError(
+            f"{piece.name} of {words_of(piece.high_mm - piece.low_mm)} mm needs {count:.0f} sheets or more; "
+            f"up to {LARGEST_PAGES} are made: take larger paper, or check that sizes are in mm"
+        )
+
+
+def _cuts(piece: Piece, axis: int, room: float, overlap: float) -> tuple[list[float], float]:
+    """Cuts along an axis, and how far tiles are printed beyond them: the overlap, or more where targets reach over a cut."""
+    low, high = float(piece.low_mm[axis]), float(piece.high_mm[axis])
+    if high - low <= room:
+        return [], overlap
+    center, reach = piece.keep_mm[:, axis], piece.keep_mm[:, 2] + CLEARANCE_MM
+    cuts = _walk(low, high, room, overlap, center, reach)
+    crossed = (np.abs(np.array(cuts)[:, None] - center) < reach - CLEARANCE_MM / 2).any() if len(center) and cuts else False
+    wider = float(max(overlap, piece.keep_mm[:, 2].max(initial=0.0) + TAB_MM))
+    if not crossed or wider == overlap:
+        return cuts, overlap
+    if room <= 2 * wider:
+        raise InputError(
+            f"no cut passes between the targets, and tabs of {wider:.4g} mm around them leave nothing of {room:.4g} mm of paper; "
+            "take larger paper"
+        )
+    return _walk(low, high, room, wider, center, reach), wider
+
+
+def _walk(low: float, high: float, room: float, overlap: float, center: Array, reach: Array) -> list[float]:
+    """Cuts as far apart as the room allows, each moved back to where it crosses no target if there is such a place."""
+    cuts: list[float] = []
+    start, last = low, low
+    while high - start > room:
+        most = start + room - overlap
+        cut = most
+        while True:
+            hit = np.abs(center - cut) < reach - 1e-9
+            if not hit.any():
+                break
+            cut = float((center - reach)[hit].min())
+            if cut < last + SMALLEST_PART * (most - last):
+                cut = most
+                break
+        cuts.append(cut)
+        start, last = cut - overlap, cut
+    return cuts
+
+
+def _tile(piece: Piece, row: int, column: int, cut_low: Array, cut_high: Array, grow: Array) -> Tile:
+    keep = piece.keep_mm
+    inside = ((keep[:, :2] >= cut_low) & (keep[:, :2] < cut_high)).all(axis=1)
+    own = np.flatnonzero(inside)
+    # the outer edges of the piece are no cuts
+    is_cut = np.concatenate([cut_low > piece.low_mm, cut_high < piece.high_mm])
+    over = np.concatenate([keep[own, :2] - keep[own, 2:] < cut_low, keep[own, :2] + keep[own, 2:] > cut_high], axis=1)
+    low, high = (np.where(is_cut[:2], cut_low - grow, cut_low), np.where(is_cut[2:], cut_high + grow, cut_high))
+    return Tile(row, column, own, own[(over & is_cut).any(axis=1)], cut_low, cut_high, low, high)
+
+
+def _crosses(piece: Piece, edges: list[list[float]]) -> Array:
+    """Places (c, 2) on the cuts that are free of ink, at the meetings of cuts and borders and every CROSS_STEP_MM between them."""
+    found: list[Array] = []
+    for axis in (0, 1):
+        other = 1 - axis
+        along = np.arange(edges[other][0], edges[other][-1], 2.0)
+        for cut in edges[axis][1:-1]:
+            places = np.empty((len(along) + len(edges[other]), 2))
+            places[:, axis] = cut
+            places[:, other] = [*edges[other], *along]
+            for place in places[_free(places, piece.keep_mm)]:
+                if all(np.linalg.norm(place - known) >= CROSS_STEP_MM for known in found):
+                    found.append(place)
+    return np.array(found).reshape(-1, 2)
+
+
+def _free(places: Array, keep: Array) -> NDArray[np.bool_]:
+    if not len(keep):
+        return np.ones(len(places), dtype=bool)
+    return np.asarray((np.linalg.norm(places[:, None] - keep[:, :2], axis=-1) > keep[:, 2] + CROSS_ARM_MM).all(axis=1))
