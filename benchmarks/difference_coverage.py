@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from dishmap.camera.model import Camera
 from dishmap.difference.bound import joint_bound
-from dishmap.difference.difference_map import DifferenceMap, joint_difference
+from dishmap.difference.difference_map import Considered, joint_difference
 from dishmap.difference.response import pose_response
 from dishmap.quality import Quality
 from dishmap.simulate.deform import Bump, Crease, Deformation, Gores, ZernikeTerm, deform, displacement_mm
@@ -242,7 +242,10 @@ def scaled(state: Deformation, factor: float, slide: str) -> Deformation:
 
 @dataclass(frozen=True)
 class Trial:
-    """One dish: what was drawn, errors and sigmas (N,) of shape and displacement, true shape, the bound's variance, and the estimate."""
+    """One dish: what was drawn, errors and sigmas (N,) of shape and displacement, true shape, the bound's variance, what was thought.
+
+    considered: the hypotheses; aside: number of targets put aside; open_expansion: a change of scale was taken for a possible expansion.
+    """
 
     family: str
     slide: str
@@ -253,7 +256,12 @@ class Trial:
     sigma: Array
     true_shape: Array
     bound_mm2: Array
-    found: DifferenceMap
+    considered: tuple[Considered, ...]
+    aside: int
+    noise_factor: float
+    converged: bool
+    open_expansion: bool
+    changed: bool
 
     @property
     def size(self) -> str:
@@ -281,7 +289,12 @@ def trial(at: Bench, family: str, slide: str, rng: Generator) -> Trial:
         found.sigma_displacement_mm,
         shape,
         bound,
-        found,
+        found.considered,
+        int((found.quality & Quality.OUTLIER > 0).sum()),
+        found.noise_factor,
+        found.converged,
+        found.expansion_assumed[1] > 0,
+        found.significance.changed,
     )
 
 
@@ -350,18 +363,17 @@ def outside(value: float, by: float) -> bool:
 
 def learnt_row(trials: Sequence[Trial]) -> tuple[object, ...]:
     """What the estimate thought: mean weights of the ways, medians of length and sizes under the best hypothesis, targets put aside."""
-    weights = {way: np.mean([sum(c.weight for c in t.found.considered if c.way == way) for t in trials]) for way in WAYS}
-    best = [max(t.found.considered, key=lambda c: c.weight) for t in trials]
+    weights = {way: np.mean([sum(c.weight for c in t.considered if c.way == way) for t in trials]) for way in WAYS}
+    best = [max(t.considered, key=lambda c: c.weight) for t in trials]
     sizes = [float(np.median([b.sizes[name] for b in best])) for name in ("normal_mm", "rough_mm", "slide_strain", "print_strain")]
-    aside = sum(int((t.found.quality & Quality.OUTLIER > 0).sum()) for t in trials)
-    changed = 100 * float(np.mean([t.found.significance.changed for t in trials]))
-    noisy = max(t.found.noise_factor for t in trials)
-    unsettled = sum(not t.found.converged for t in trials)
-    # whether a change of scale of the whole picture was taken for a possible expansion
-    grown = sum(t.found.expansion_assumed[1] > 0 for t in trials)
+    aside = sum(t.aside for t in trials)
+    changed = 100 * float(np.mean([t.changed for t in trials]))
+    noisy = max(t.noise_factor for t in trials)
+    unsettled = sum(not t.converged for t in trials)
+    grown = sum(t.open_expansion for t in trials)
     ways = (round(w, 2) for w in weights.values())
     moved = [t for t in trials if t.family != "none"]
-    true = round(float(np.mean([sum(c.weight for c in t.found.considered if c.way == t.slide) for t in moved])), 2) if moved else ""
+    true = round(float(np.mean([sum(c.weight for c in t.considered if c.way == t.slide) for t in moved])), 2) if moved else ""
     return (*ways, true, np.median([b.length_mm for b in best]), *sizes, aside, noisy, unsettled, grown, changed)
 
 

@@ -65,7 +65,8 @@ def test_zernike_terms_come_back_with_their_sigma() -> None:
     for (n, m), value, s in zip(found.zernike_terms, found.zernike_mm, sigma, strict=True):
         expected = {(2, 2): 0.3, (4, 0): 0.1}.get((n, m), 0.0)
         assert abs(value - expected) < SIGMAS * s, (n, m)
-        assert s < 0.03
+        # the finest terms of 37 targets
+        assert s < 0.04
 
 
 def test_the_sigma_of_the_shape_is_true() -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dishmap.io.atomic import write_files
 from dishmap.io.pattern_file import format_pattern
 from dishmap.sheet.boards import CornerBoard
+from dishmap.sheet.flatten import AlongMeridian
 from dishmap.sheet.pdf import pdf_bytes
 from dishmap.sheet.sheets import Sheets
 from dishmap.sheet.svg import svg_text
@@ -81,7 +82,13 @@ def sheets_list(sheets: Sheets) -> dict[str, Any]:
         "bar_mm": paper.bar_mm,
         "pages": [page_name(number) for number in range(1, len(sheets.pages) + 1)],
         "pieces": [
-            {"name": piece.name, "place": piece.note, "anchor_mm": _rounded(piece.anchor_mm), "strain": round(piece.strain, 7)}
+            {
+                "name": piece.name,
+                "place": piece.note,
+                "azimuth_deg": round(float(np.degrees(piece.map.azimuth_rad)), 6) if isinstance(piece.map, AlongMeridian) else None,
+                "anchor_mm": _rounded(piece.anchor_mm),
+                "strain": round(piece.strain, 7),
+            }
             for piece in sheets.pieces
         ],
         "placed": placed,

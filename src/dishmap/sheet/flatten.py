@@ -22,11 +22,11 @@ from dishmap.targets.pattern import Surface
 
 Array = NDArray[np.float64]
 
-# Runge-Kutta steps along a geodesic: 1e-9 mm over 200 mm on a dish of 300 mm focal length.
-STEPS = 24
-# Newton steps for the way back; six are enough for rounding.
+# Runge-Kutta steps along a geodesic: right to 3e-6 mm over 100 mm on a dish of 100 mm focal length.
+STEPS = 12
+# Newton steps for the way back, and where they may end.
 NEWTON_STEPS = 12
-NEWTON_MM = 1e-11
+NEWTON_MM = 1e-9
 
 
 class FlatMap(Protocol):
