@@ -67,21 +67,22 @@ SHOWN_MM = 0.03
 
 @dataclass(frozen=True)
 class Moved:
-    """What N targets of a pattern really did, in its order: displacement, depth change and shape (N,) in mm."""
+    """What N targets of a pattern really did, in its order: move (N, 3) in the dish frame, displacement and depth change (N,), in mm."""
 
+    move_mm: Array
     displacement_mm: Array
     depth_mm: Array
-    shape_mm: Array
+    pattern: Pattern
+
+    def shape_mm(self, index: Array) -> Array:
+        """Shape (K,) of the targets number `index`: what is left of a rigid motion depends on which targets it is fitted to."""
+        return shape_of(self.move_mm[index], self.pattern.center_mm[index], self.pattern.normal[index])
 
 
 def true_change(before: Truth, after: Truth, pattern: Pattern, camera_from_dish: Pose) -> Moved:
     """From two truths in the camera frame; camera_from_dish: true one of the reference."""
     move = (after.center_mm - before.center_mm) @ camera_from_dish.rotation
-    return Moved(
-        (move * pattern.normal).sum(axis=1),
-        after.center_mm[:, 2] - before.center_mm[:, 2],
-        shape_of(move, pattern.center_mm, pattern.normal),
-    )
+    return Moved(move, (move * pattern.normal).sum(axis=1), after.center_mm[:, 2] - before.center_mm[:, 2], pattern)
 
 
 def true_pose(truth: Truth, pattern: Pattern) -> Pose:
@@ -196,17 +197,17 @@ def plate_data() -> None:
 
 def dish_rows(name: str, before: Photograph, after: Photograph, camera: Camera, pattern: Pattern, true: Moved) -> tuple[list[Any], Any]:
     out: list[list[object]] = []
-    maps = []
+    maps, size = [], rms(true.shape_mm(np.arange(len(pattern))))
     for title, priors in (("joint", Priors()), ("joint, strain free", Priors(strain="free"))):
         found = joint_difference(poses_of(before), poses_of(after), camera, pattern, priors)
         maps.append(found)
-        error = found.shape_mm - true.shape_mm[found.index]
+        error = found.shape_mm - true.shape_mm(found.index)
         whole = found.displacement_mm - true.displacement_mm[found.index]
         score = error / found.sigma_shape_mm
         best = max(found.considered, key=lambda c: c.weight)
         out.append(
             [
-                *(name, title, rms(true.shape_mm), rms(error), rms(found.sigma_shape_mm), rms(score), covered(score), rms(whole)),
+                *(name, title, size, rms(error), rms(found.sigma_shape_mm), rms(score), covered(score), rms(whole)),
                 *(rms(found.sigma_displacement_mm), f"{best.way}, {best.length_mm:.0f} mm", verdict(rms(error), GOAL_SHAPE)),
             ]
         )
@@ -215,9 +216,9 @@ def dish_rows(name: str, before: Photograph, after: Photograph, camera: Camera, 
         basis=Basis("zernike", PAPER_DEGREE),
     )
     index = rows_of(pattern, theirs.ids)
-    shape = rest_of(theirs.displacement_mm, pattern, index) - true.shape_mm[index]
+    shape = rest_of(theirs.displacement_mm, pattern, index) - true.shape_mm(index)
     whole = theirs.displacement_mm - true.displacement_mm[index]
-    out.append([name, "paper", rms(true.shape_mm), rms(shape), "", "", "", rms(whole), "", f"zernike:{PAPER_DEGREE}", ""])
+    out.append([name, "paper", size, rms(shape), "", "", "", rms(whole), "", f"zernike:{PAPER_DEGREE}", ""])
     return out, maps[0]
 
 
@@ -321,7 +322,7 @@ def camera_shift() -> None:
             after, made = shot(scene.with_state(BENT), np.random.default_rng([6, seed]))
             maps.append(compared(before, after, base))
             true = true_change(first.truth, made.truth, base.pattern, base.camera_from_dish)
-            errors.append(rms(maps[-1].shape_mm - true.shape_mm[maps[-1].index]))
+            errors.append(rms(maps[-1].shape_mm - true.shape_mm(maps[-1].index)))
         between = rms(maps[1].shape_mm - maps[0].shape_mm) if len(maps[0]) == len(maps[1]) else float("nan")
         moved = (base.camera_from_dish.inverse() @ shifted.camera_from_dish).translation_mm
         moved = maps[1].rigid_motion.translation_mm - maps[0].rigid_motion.translation_mm - moved
@@ -367,11 +368,11 @@ def outliers() -> None:
         for after in (clean, dirty):
             found = compared(before, after, base)
             rows = np.flatnonzero(np.isin(found.index, good))
-            scores.append(rms((found.shape_mm - true.shape_mm[found.index])[rows]))
+            scores.append(rms((found.shape_mm - true.shape_mm(found.index))[rows]))
         flagged = found.quality & Quality.OUTLIER > 0
         missed = int((np.isin(found.index, off) & ~flagged).sum())
         wrongly = int((np.isin(found.index, good) & flagged).sum())
-        everyone = rms(found.shape_mm - true.shape_mm[found.index])
+        everyone = rms(found.shape_mm - true.shape_mm(found.index))
         ratio = scores[1] / scores[0]
         every.append(scores)
         table.append((seed, *scores, ratio, everyone, rms(found.sigma_shape_mm), len(off), missed, wrongly, verdict(ratio, GOAL_DIRTY)))
@@ -394,7 +395,7 @@ def expansion() -> None:
         for name, priors in (("nothing said", Priors()), ("2000 +- 100 ppm", Priors(expansion_ppm=(2000.0, 100.0)))):
             found = compared(before, after, base, priors)
             error = found.depth_change_mm - true.depth_mm[found.index]
-            shape = found.shape_mm - true.shape_mm[found.index]
+            shape = found.shape_mm - true.shape_mm(found.index)
             score = np.abs(error / found.sigma_depth_change_mm).max()
             table.append(
                 [

@@ -50,6 +50,8 @@ def joint_of(pattern: Pattern, **changes: Any) -> DifferenceMap:
         du_dv_px=0.01 * pattern.center_mm[:, :2],
         misfit=rng.uniform(0.5, 1.3, n),
         quality=np.zeros(n, dtype=np.int64),
+        displacement_factor=np.zeros((n, 1)),
+        displacement_own_mm2=np.zeros(n),
         shape_factor=np.zeros((n, 1)),
         shape_own_mm2=np.full(n, SIGMA_MM**2),
         rigid_motion=Pose.from_rotation_vector(np.radians([0.05, 0.0, 0.0]), [0.1, 0.0, 0.3]),

@@ -24,7 +24,8 @@ ORDER = [
     *("errors", "quality", "transforms", "robust"),
     # the camera
     *("camera.model", "camera.undistort", "camera.board", "camera.chessboard", "camera.bundle", "camera.problem"),
-    *("camera.screening", "camera.calibrate", "camera.uncertainty"),
+    *("camera.screening", "camera.calibrate", "camera.uncertainty", "camera.lens_choice", "camera.compare_cameras"),
+    *("camera.resample", "camera.advice"),
     # shapes in which deformations are spoken of
     *("surface.zernike",),
     # what is printed
@@ -60,7 +61,8 @@ ORDER = [
     *("sheet.shapes", "sheet.pdf", "sheet.svg", "sheet.flatten", "sheet.pieces", "sheet.seams", "sheet.gores", "sheet.markers"),
     *("sheet.boards", "sheet.outline", "sheet.paper", "sheet.tiles", "sheet.layout", "sheet.printed", "sheet.sheets"),
     # files
-    *("io.atomic", "io.image_header", "io.images", "io.picture_file", "io.pose_file", "io.camera_file", "io.pattern_file"),
+    *("io.atomic", "io.image_header", "io.images", "io.picture_file", "io.pose_file", "io.camera_formats", "io.camera_file"),
+    "io.pattern_file",
     *("io.scenario_file", "io.truth_file", "io.points_file", "io.measurement_file", "io.results"),
     *("io.difference_file", "io.difference_results", "io.sheet_file"),
     # people: what a map says in words, in pictures, on a page

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dishmap.camera.board import BoardView
+from dishmap.camera.board import BENDS, BoardShape, BoardView
 from dishmap.camera.calibrate import Calibration
 from dishmap.camera.model import Camera
 from dishmap.errors import ImageError
@@ -248,7 +248,7 @@ def test_what_is_missing_or_strange_is_told(hidden: Shot) -> None:
     html = map_report(result, hidden.image, "hidden", {})
     said = words(html)
     assert "11 of 12 targets measured; 1 " in said
-    assert f"1 target flagged off_surface ({result.cloud.ids[5]}): the target lies far from the surface" in said
+    assert f"1 target flagged off_surface ({result.cloud.ids[5]}): the target lies, or moved, far from the surface" in said
     assert f"1 target flagged glare ({result.cloud.ids[5]}): " in said
     assert "10 of 11 targets measured are clean" in said
     assert "covariance is unknown" in said
@@ -347,6 +347,11 @@ def test_the_report_of_a_calibration() -> None:
         coverage=0.43,
         rejected={"<bad>": "it is <blurred>"},
         notes=("few views",),
+        lens="opencv5",
+        view_weight=np.ones(4),
+        board=BoardShape(np.zeros(2), 50.0, np.zeros(len(BENDS)), np.eye(len(BENDS))),
+        expected=CAMERA.parameters,
+        independent=1.0,
     )
     html = calibration_report(calibration, HOSTILE)
     said = words(html)

@@ -31,11 +31,11 @@ class Quality(IntFlag):
 
 MEANING: dict[Quality, str] = {
     Quality.CLIPPED: "part of the target lies outside the image",
-    Quality.OCCLUDED: "part of the target is hidden or overprinted; the rest was measured",
-    Quality.GLARE: "saturated pixels or light where ink should be; those pixels were left out",
+    Quality.OCCLUDED: "part of the target is hidden, overprinted or too near its neighbour; the rest was measured",
+    Quality.GLARE: "saturated pixels, which were left out, or light that bends across the target, which was fitted; sigmas are wider",
     Quality.POOR_FIT: "the pixels differ from the model by more than the image's noise explains; sigmas are scaled up",
     Quality.TOO_SMALL: "the smallest printed circle is under 2 px in radius",
-    Quality.AMBIGUOUS_NORMAL: "a mirrored normal fits the pixels as well; the one nearer to the pattern's surface is given",
+    Quality.AMBIGUOUS_NORMAL: "a mirrored normal fits nearly as well; the one that pixels and the pattern's surface make likelier is given",
     Quality.OFF_SURFACE: "the target lies, or moved, far from the surface through its neighbours",
     Quality.NOT_CONVERGED: "the fit to the pixels did not converge",
     Quality.WEAK_DEPTH: "depth rests on the assumed ink spread (a lone disc), not on the image alone",

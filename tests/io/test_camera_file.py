@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from dishmap.camera.board import BoardView
+from dishmap.camera.board import BENDS, BoardShape, BoardView
 from dishmap.camera.calibrate import Calibration
 from dishmap.camera.model import Camera
 from dishmap.errors import CameraError, InputError
@@ -357,6 +357,11 @@ def calibration(count: int) -> Calibration:
         coverage=0.5,
         rejected={"e.jpg": "no chessboard: found, or so"},
         notes=(),
+        lens="opencv5",
+        view_weight=np.ones(count),
+        board=BoardShape(np.zeros(2), 50.0, np.zeros(len(BENDS)), np.eye(len(BENDS))),
+        expected=LENS5.parameters,
+        independent=1.0,
     )
 
 

@@ -257,9 +257,9 @@ def _check_turn(bundle: Bundle) -> None:
 
 
 def shared_covariance(camera: Camera, equations: ba.NormalEquations, sigma_px: float) -> tuple[Array, float, float]:
-    """Covariance of camera parameters and bends with the poses marginalised out, the mean factor of its sigmas for clustering, and the
-    part of the noise that is taken as independent.
+    """Covariance of camera parameters and bends with the poses marginalised out; factor of its sigmas; independent part of the noise.
 
+    The factor is by how much clustering of the noise within views enlarges sigmas on average.
     In coordinates where independent noise gives the unit matrix, each view adds the outer product of its score, adjusted for
     its leverage (CR2 of Bell and McCaffrey 2002: unbiased if corners are independent). With 10 to 20 views the sum is noisy, so it is
     shrunk towards a multiple of the unit matrix by the amount that its own scatter calls for (Ledoit and Wolf 2004).

@@ -16,16 +16,14 @@ from dishmap.camera.board import BoardView
 from dishmap.camera.calibrate import Calibration, calibrate
 from dishmap.camera.model import Camera
 from dishmap.camera.screening import FEWEST_VIEWS
+from dishmap.camera.uncertainty import covered_area, picture_grid, scene_points
 from dishmap.errors import CameraError, DishmapError
 from dishmap.transforms import cross_matrix, rotation_from_vector
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-GRID = (24, 32)
 MOTION_STEPS = 10
-# The area that corners cover: cells of the grid with a corner within this many cells.
-COVER_CELLS = 1.0
 FEWEST_POINTS = 6
 
 
@@ -57,21 +55,6 @@ class CameraDifference:
         return float(np.nanmax(self.length_px[self.covered]))
 
 
-def picture_grid(width_px: int, height_px: int, grid: tuple[int, int] = GRID) -> Array:
-    """Pixels (R, C, 2) spread evenly over a picture, from edge to edge."""
-    rows, columns = grid
-    return np.stack(np.meshgrid(np.linspace(-0.5, width_px - 0.5, columns), np.linspace(-0.5, height_px - 0.5, rows)), axis=-1)
-
-
-def covered_area(pixels: Array, seen_px: Array) -> Mask:
-    """Which points of a grid (R, C, 2) have a corner of seen_px (N, 2) within a cell of the grid."""
-    step = np.array([pixels[0, 1, 0] - pixels[0, 0, 0], pixels[1, 0, 1] - pixels[0, 0, 1]])
-    from scipy.spatial import cKDTree
-
-    distance, _ = cKDTree(seen_px / step).query(pixels / step, distance_upper_bound=COVER_CELLS * np.sqrt(2))
-    return np.asarray(np.isfinite(distance))
-
-
 def camera_difference(first: Camera, second: Camera, distance_mm: float, *seen_px: Array) -> CameraDifference:
     """Compare two cameras of one picture size over points at a distance.
 
@@ -88,10 +71,8 @@ def camera_difference(first: Camera, second: Camera, distance_mm: float, *seen_p
     covered = np.ones(pixels.shape[:2], dtype=bool)
     for seen in seen_px:
         covered &= covered_area(pixels, seen)
-    rays = first.unproject(pixels)
-    near = np.isfinite(distance_mm)
-    points = rays * (distance_mm / rays[..., 2:] if near else 1.0)
-    moved = _moved(second, points, pixels, covered, near)
+    points = scene_points(first, pixels, distance_mm)
+    moved = _moved(second, points, pixels, covered, bool(np.isfinite(distance_mm)))
     return CameraDifference(pixels, second.project(moved) - pixels, covered)
 
 

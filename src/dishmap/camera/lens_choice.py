@@ -25,7 +25,7 @@ FOLDS = 4
 # Fewer views leave too few to fit to.
 FEWEST_VIEWS = 8
 # A leaner lens is as good when it is worse by less than one standard error over the views, or by less than this part.
-SAME_PART = 0.005
+SAME_PART = 0.01
 
 
 @dataclass(frozen=True)
@@ -112,13 +112,15 @@ def _chosen(errors: dict[str, Array]) -> tuple[str, str]:
     logs = {lens: np.log(np.maximum(e, 1e-12)) for lens, e in errors.items()}
     best = min(logs, key=lambda lens: float(np.nanmean(logs[lens])))
     level = float(np.exp(np.nanmean(logs[best])))
-    for lens in logs:
-        worse = logs[lens] - logs[best]
+    for lens, log in logs.items():
+        worse = log - logs[best]
         worse = worse[~np.isnan(worse)]
+        if not np.isfinite(worse).all():
+            continue
         mean, error = float(worse.mean()), float(worse.std(ddof=1) / np.sqrt(len(worse)))
         if lens == best:
             return lens, f"{lens} has the smallest error on views held out ({level:.3g} px), and no leaner lens model comes near it"
-        if np.isfinite(mean) and mean <= max(error, SAME_PART):
+        if mean <= max(error, SAME_PART):
             by = f"{100 * np.expm1(mean):.2g} %, standard error {100 * error:.2g} %"
             return lens, f"{lens} is the leanest lens model whose error on views held out equals that of the best ({best}; worse by {by})"
     raise AssertionError("the best lens is among the lenses")

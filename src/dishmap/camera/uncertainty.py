@@ -18,6 +18,10 @@ from dishmap.transforms import cross_matrix
 Array = NDArray[np.float64]
 
 GRID = (24, 32)
+# The area that corners cover: points of the grid with a corner within this many cells.
+COVER_CELLS = 1.0
+# A motion is fitted over at least so many points.
+FEWEST_POINTS = 6
 
 
 @dataclass(frozen=True)
@@ -41,24 +45,51 @@ class ProjectionError:
         return float(np.sqrt(np.nanmean(self.sigma_px**2)))
 
 
-def projection_error(camera: Camera, grid: tuple[int, int] = GRID, remove_rotation: bool = False) -> ProjectionError:
+def picture_grid(width_px: int, height_px: int, grid: tuple[int, int] = GRID) -> Array:
+    """Pixels (R, C, 2) spread evenly over a picture, from edge to edge."""
+    rows, columns = grid
+    return np.stack(np.meshgrid(np.linspace(-0.5, width_px - 0.5, columns), np.linspace(-0.5, height_px - 0.5, rows)), axis=-1)
+
+
+def covered_area(pixels: Array, seen_px: Array) -> NDArray[np.bool_]:
+    """Which points of a grid (R, C, 2) have a corner of seen_px (N, 2) within a cell of the grid."""
+    from scipy.spatial import cKDTree
+
+    step = np.array([pixels[0, 1, 0] - pixels[0, 0, 0], pixels[1, 0, 1] - pixels[0, 0, 1]])
+    distance, _ = cKDTree(seen_px / step).query(pixels / step, distance_upper_bound=COVER_CELLS * np.sqrt(2))
+    return np.asarray(np.isfinite(distance))
+
+
+def scene_points(camera: Camera, pixels: Array, distance_mm: float) -> Array:
+    """Points (..., 3) seen at pixels (..., 2), on a plane across the axis at a distance; unit rays for an infinite one."""
+    rays = camera.unproject(pixels)
+    return rays * (distance_mm / rays[..., 2:]) if np.isfinite(distance_mm) else rays
+
+
+def projection_error(
+    camera: Camera,
+    grid: tuple[int, int] = GRID,
+    remove_rotation: bool = False,
+    distance_mm: float | None = None,
+    covered: NDArray[np.bool_] | None = None,
+) -> ProjectionError:
     """Return the expected projection error of a calibrated camera over its picture.
 
     grid: rows and columns of points, spread evenly from edge to edge. remove_rotation: leave out the part that a small
-    turn of the camera explains best over the whole picture. Nothing measured in the camera's own picture can see that
-    part apart from the camera's attitude, so this is the error of shapes; without it, of directions.
+    turn of the camera explains best. Nothing measured in the camera's own picture can see that part apart from the camera's
+    attitude, so this is the error of shapes; without it, of directions. distance_mm: leave out the part that a small turn
+    and shift explain best, for points at this distance: the error of shapes there. covered (R, C): fit the motion over these points only.
     Raises CameraError when the camera carries no covariance.
     """
     if camera.covariance is None:
         raise CameraError("this camera carries no covariance; calibrate it with `dishmap calibrate` to get one")
-    rows, columns = grid
-    if rows < 2 or columns < 2:
-        raise CameraError(f"a map of the projection error needs at least 2x2 points, not {rows}x{columns}")
-    u, v = np.linspace(-0.5, camera.width_px - 0.5, columns), np.linspace(-0.5, camera.height_px - 0.5, rows)
-    pixels = np.stack(np.meshgrid(u, v), axis=-1)
+    if min(grid) < 2:
+        raise CameraError(f"a map of the projection error needs at least 2x2 points, not {grid[0]}x{grid[1]}")
+    pixels = picture_grid(camera.width_px, camera.height_px, grid)
     jacobian = direction_jacobian(camera, pixels)
-    if remove_rotation:
-        jacobian = _without_rotation(camera, pixels, jacobian)
+    if remove_rotation or distance_mm is not None:
+        points = scene_points(camera, pixels, np.inf if distance_mm is None else distance_mm)
+        jacobian = _without_motion(camera, points, jacobian, distance_mm is not None, covered)
     covariance = jacobian @ camera.covariance @ np.swapaxes(jacobian, -1, -2)
     return ProjectionError(pixels, covariance)
 
@@ -68,12 +99,18 @@ def direction_jacobian(camera: Camera, pixels: ArrayLike) -> Array:
     return camera.project_with_jacobians(camera.unproject(pixels))[2]
 
 
-def _without_rotation(camera: Camera, pixels: Array, jacobian: Array) -> Array:
-    """Take from each parameter's field of pixel shifts the rotation that fits it best over all points."""
-    rays = camera.unproject(pixels)
-    _, by_point, _ = camera.project_with_jacobians(rays)
-    turn = -by_point @ cross_matrix(rays)
-    good = np.isfinite(jacobian).all(axis=(-2, -1)) & np.isfinite(turn).all(axis=(-2, -1))
-    design = turn[good].reshape(-1, 3)
-    fitted, *_ = np.linalg.lstsq(design, jacobian[good].reshape(len(design), -1), rcond=None)
-    return jacobian - turn @ fitted
+def _without_motion(camera: Camera, points: Array, jacobian: Array, shift: bool, covered: NDArray[np.bool_] | None) -> Array:
+    """Take from each parameter's field of pixel shifts the turn (and shift) that fits it best over all points, or those covered."""
+    _, by_point = camera.project_with_point_jacobian(points)
+    motion = -by_point @ cross_matrix(points)
+    if shift:
+        motion = np.concatenate([motion, by_point], axis=-1)
+    good = np.isfinite(jacobian).all(axis=(-2, -1)) & np.isfinite(motion).all(axis=(-2, -1))
+    if covered is not None:
+        good &= covered
+    if good.sum() < FEWEST_POINTS:
+        return jacobian
+    design = motion[good].reshape(-1, motion.shape[-1])
+    scale = np.linalg.norm(design, axis=0)
+    fitted, *_ = np.linalg.lstsq(design / scale, jacobian[good].reshape(len(design), -1), rcond=None)
+    return jacobian - motion @ (fitted / scale[:, None])

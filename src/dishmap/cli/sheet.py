@@ -141,7 +141,7 @@ def dish_sheet(
 @click.option("--grid", type=Grid(), metavar="NxM", help="Circles or rings along x and y.")
 @click.option("--pitch-mm", type=POSITIVE, help="From circle to circle; of acircles, between neighbouring rows.")
 @click.option(
-    "--radius-mm", type=POSITIVE, help="Of a circle, or a ring's outer edge.  [default: 0.3 of the pitch; rings 0.35, acircles 0.5]"
+    "--radius-mm", type=POSITIVE, help="Of a circle, or a ring's outer edge.  [default: 0.3 to 0.4 of the pitch]"
 )
 @click.option("--inner-radius-mm", type=POSITIVE, help="Of a ring's hole.  [default: half of the outer one]")
 @click.option("--no-orientation-marks", is_flag=True, help="Let all circles or rings look alike.")

@@ -1,8 +1,9 @@
 """Camera files: YAML as `cv2.FileStorage` writes it, with the covariance and the observations of a calibration beside it.
 
 Keys that OpenCV's calibration programs write: image_width, image_height, camera_matrix, distortion_coefficients. Ours beside
-them: model (`opencv` or `fisheye`), parameter_names and parameter_covariance, and of a calibration its rms, the rms of each
-view, the corners it was made from, and what was left out. Other keys are passed over, since OpenCV's files have many.
+them: model (`opencv` or `fisheye`), parameter_names and parameter_covariance, and of a calibration its rms, the rms and weight of
+each view, the board's bends, the corners it was made from, and what was left out. Other keys are passed over, since OpenCV's files
+have many.
 
 The parser is our own: it reads no more than such files need, exactly, and a hostile file meets Python instead of C++.
 """
@@ -18,11 +19,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dishmap.camera.board import BoardView
+from dishmap.camera.board import BENDS, BoardView
 from dishmap.camera.calibrate import Calibration
 from dishmap.camera.model import Camera
 from dishmap.errors import CameraError, InputError
 from dishmap.io.atomic import write_text
+from dishmap.io.camera_formats import is_kalibr, is_mrcal, read_kalibr, read_mrcal
 
 Array = NDArray[np.float64]
 
@@ -45,32 +47,44 @@ _STRING = re.compile(r'"(?:[^"\\]|\\.)*"')
 
 
 def read_camera(path: str | Path) -> Camera:
-    """Read a camera from OpenCV's YAML, with the covariance if the file has it.
+    """Read a camera from OpenCV's YAML, with the covariance if the file has it; or as ROS, mrcal and Kalibr write it.
 
     Takes 0, 4, 5, 8 or 12 lens coefficients (14 without tilt), and ROS's distortion_model names.
     Raises CameraError, in one sentence, when the file cannot be read, lacks a key, or describes no possible camera.
     """
     try:
-        return _camera(_sections(_read(Path(path))))
+        text = _read(Path(path))
+        if is_mrcal(text):
+            return _checked(read_mrcal(text))
+        if is_kalibr(text):
+            return _checked(read_kalibr(text))
+        return _camera(_sections(_yaml(text)))
     except CameraError as error:
         raise CameraError(f"cannot use {path} as a camera file: {error}") from error
 
 
 def read_views(path: str | Path) -> tuple[BoardView, ...]:
-    """Read the views of a board that a camera was calibrated from; none if the file does not hold them.
+    """Read the views of a board that a camera was calibrated from, all their corners; none if the file does not hold them.
 
     `calibrate` gives the same camera from them again. Raises CameraError as `read_camera`.
     """
     try:
-        sections = _sections(_read(Path(path)))
+        text = _read(Path(path))
+        sections = {} if is_mrcal(text) or is_kalibr(text) else _sections(_yaml(text))
         if "corners" not in sections:
             return ()
         names = [str(json.loads(text)) for text in _STRING.findall(sections.get("view_names", ""))]
         view, corners = _matrix(sections, ("corner_view",))[:, 0], _matrix(sections, ("corners",))
         if corners.shape != (len(view), 5) or not np.isin(view, np.arange(len(names))).all():
             raise CameraError("corners, corner_view and view_names do not belong together; write the file again")
-        parts = [corners[view == k] for k in range(len(names))]
-        return tuple(BoardView(name, part[:, :2], part[:, 2:]) for name, part in zip(names, parts, strict=True))
+        radius = _matrix(sections, ("corner_radius_mm",)).ravel() if "corner_radius_mm" in sections else None
+        if radius is not None and len(radius) != len(view):
+            raise CameraError("corners and corner_radius_mm do not belong together; write the file again")
+        rows = [view == k for k in range(len(names))]
+        return tuple(
+            BoardView(name, corners[row, :2], corners[row, 2:], None if radius is None else radius[row])
+            for name, row in zip(names, rows, strict=True)
+        )
     except (CameraError, InputError, ValueError) as error:
         raise CameraError(f"cannot read the views of {path}: {error}") from error
 
@@ -99,14 +113,24 @@ def camera_text(camera: Camera, calibration: Calibration | None = None) -> str:
 def _calibration_lines(calibration: Calibration) -> list[str]:
     corners = [np.concatenate([view.pixels, view.board_mm], axis=1) for view in calibration.views]
     index = np.repeat(np.arange(len(corners)), [len(part) for part in corners])
+    board = calibration.board
+    radius = [np.zeros(len(view.pixels)) if view.radius_mm is None else view.radius_mm for view in calibration.views]
+    circles = _matrix_lines("corner_radius_mm", np.concatenate(radius)[:, None]) if any(r.any() for r in radius) else []
     return [
+        f"calibration_lens: {calibration.lens}",
         f"calibration_rms_px: {_number(calibration.rms_px)}",
         f"calibration_inflation: {_number(calibration.inflation)}",
         _strings("view_names", calibration.view_names),
         *_matrix_lines("view_rms_px", calibration.view_rms_px[None, :]),
         _strings("rejected_views", (f"{name}: {reason}" for name, reason in calibration.rejected.items())),
+        *_matrix_lines("view_weight", calibration.view_weight[None, :]),
+        f"board_bend_names: [ {', '.join(BENDS)} ]",
+        *_matrix_lines("board_bend_mm", board.bend_mm[None, :]),
+        *_matrix_lines("board_bend_sigma_mm", board.sigma_mm[None, :]),
         *_matrix_lines("corner_view", index[:, None], "i"),
+        *_matrix_lines("corner_used", np.concatenate(calibration.used)[:, None], "i"),
         *_matrix_lines("corners", np.concatenate(corners)),
+        *circles,
     ]
 
 
@@ -143,6 +167,11 @@ def _read(path: Path) -> str:
         raise CameraError("it is not text; OpenCV's YAML is needed") from error
     except (OSError, ValueError) as error:
         raise CameraError(f"it cannot be read ({getattr(error, 'strerror', None) or error})") from error
+    return text
+
+
+def _yaml(text: str) -> str:
+    """The text, if it is not plainly something else."""
     start = text.lstrip()[:1]
     if start in ("{", "<"):
         raise CameraError(f"it is {'JSON' if start == '{' else 'XML'}; OpenCV's YAML is needed, so write it with a name that ends in .yaml")
@@ -222,6 +251,12 @@ def _camera(sections: dict[str, str]) -> Camera:
         distortion = distortion[: 12 if distortion[8:].any() else 8]
     camera = Camera(width, height, focal, matrix[:2, 2], distortion, _lens_model(sections))
     return camera if "parameter_covariance" not in sections else replace(camera, covariance=_covariance(sections, camera))
+
+
+def _checked(camera: Camera) -> Camera:
+    """The camera, if its focal length is one in pixels."""
+    _check_matrix(camera.matrix, camera.focal_px, max(camera.width_px, camera.height_px))
+    return camera
 
 
 def _check_matrix(matrix: Array, focal: Array, side: int) -> None:

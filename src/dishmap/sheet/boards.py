@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 BOARDS = ("chessboard", "charuco", "circles", "acircles", "rings")
 # Radii over the pitch: large, so that many pixels count, with as much free paper between circles as OpenCV's detectors like.
-DISC_PART, RING_PART, ASYMMETRIC_PART = 0.3, 0.35, 0.5
+DISC_PART, RING_PART, ASYMMETRIC_PART = 0.3, 0.35, 0.4
 # Radius of a ring's hole over its own.
 HOLE_PART = 0.5
 # Side of a ChArUco board's marks over its squares.
@@ -40,7 +40,8 @@ class CornerBoard:
     """A chessboard, or a ChArUco board when `dictionary` is given.
 
     corners: inner corners along x and y; square_mm: their distances as printed along x and y; marker_mm: sides of the
-    marks. Corners are counted from the upper left, x to the right and y down, as OpenCV does; the upper left square is dark.
+    marks. Corners are counted from the upper left, x to the right and y down. The upper left square is dark on a ChArUco board, as OpenCV
+    wants it, and light on a chessboard, where `find_chessboard` begins to count.
     """
 
     kind: str
@@ -152,4 +153,5 @@ def _squares(board: CornerBoard, upper_left: Array) -> Ink:
 def _cells(board: CornerBoard, dark: bool) -> list[tuple[int, int]]:
     """Rows and columns of the dark or the light squares, row by row."""
     columns, rows = board.corners[0] + 1, board.corners[1] + 1
-    return [(row, column) for row in range(rows) for column in range(columns) if ((row + column) % 2 == 0) == dark]
+    even_is_dark = board.dictionary is not None
+    return [(row, column) for row in range(rows) for column in range(columns) if ((row + column) % 2 == 0) == (dark == even_is_dark)]

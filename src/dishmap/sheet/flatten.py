@@ -18,8 +18,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dishmap.targets.pattern import Surface
-
 Array = NDArray[np.float64]
 
 # Runge-Kutta steps along a geodesic: right to 3e-6 mm over 100 mm on a dish of 100 mm focal length.
@@ -143,21 +141,15 @@ class AlongMeridian:
         point = np.column_stack([radius * c, radius * s, radius**2 / (4 * f)])
         outward = np.column_stack([np.full_like(radius, c), np.full_like(radius, s), radius / (2 * f)])
         outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-        state = np.column_stack([point, np.cross(outward, _normal(point, f)), np.ones_like(radius), np.zeros_like(radius)])
-        h = flat_mm[:, :1] / STEPS
+        state = np.concatenate([point.T, np.cross(outward, _normal(point, f)).T, [np.ones_like(radius), np.zeros_like(radius)]])
+        h = flat_mm[:, 0] / STEPS
         for _ in range(STEPS):
             k1 = _change(state, f)
             k2 = _change(state + h / 2 * k1, f)
             k3 = _change(state + h / 2 * k2, f)
             state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + _change(state + h * k3, f))
-        return state[:, :3], state[:, 3:6], np.cross(_normal(state[:, :3], f), state[:, 3:6]), state[:, 6]
-
-
-def flat_map(surface: Surface) -> Flat | AroundVertex:
-    """The map for a whole surface: none for a plane, about the vertex for a paraboloid."""
-    if surface.focal_length_mm is None or surface.kind == "plane":
-        return Flat()
-    return AroundVertex(surface.focal_length_mm)
+        point, along = state[:3].T, state[3:6].T
+        return point, along, np.cross(_normal(point, f), along), state[6]
 
 
 def meridian_mm(radius: Array, focal_length_mm: float) -> Array:
@@ -179,12 +171,12 @@ def radius_mm(way: Array, focal_length_mm: float) -> Array:
 
 
 def _change(state: Array, f: float) -> Array:
-    """Derivative of (point, direction, j, j') along a geodesic: it bends with the surface only, p'' = II(p', p') n."""
-    point, direction, ratio, slope = state[:, :3], state[:, 3:6], state[:, 6], state[:, 7]
-    steep = 1 + (point[:, :2] ** 2).sum(axis=1) / (4 * f**2)
-    bend = (direction[:, :2] ** 2).sum(axis=1) / (2 * f) / np.sqrt(steep)
+    """Derivative of (point, direction, j, j') (8, N) along a geodesic: it bends with the surface only, p'' = II(p', p') n."""
+    x, y, _, vx, vy, vz, ratio, slope = state
+    steep = 1 + (x**2 + y**2) / (4 * f**2)
+    lift = (vx**2 + vy**2) / (2 * f * steep)
     gauss = 1 / (4 * f**2) / steep**2
-    return np.column_stack([direction, bend[:, None] * _normal(point, f), slope, -gauss * ratio])
+    return np.array([vx, vy, vz, -lift * x / (2 * f), -lift * y / (2 * f), lift, slope, -gauss * ratio])
 
 
 def _normal(point: Array, f: float) -> Array:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dishmap.errors import PatternError
 from dishmap.sheet.flatten import AlongMeridian, AroundVertex, meridian_mm, radius_mm
 from dishmap.sheet.pieces import Piece, flat_piece, reach_mm
-from dishmap.sheet.seams import CLEARANCE_MM, ROW_MM, Ground, Seams, find_seams
+from dishmap.sheet.seams import CLEARANCE_MM, ROOM, ROW_MM, Ground, Seams, find_seams
 from dishmap.sheet.shapes import Line
 from dishmap.targets.pattern import Pattern
 
@@ -36,7 +36,10 @@ ARC_STEP_MM, TICKS_AT, TICK_MM = 2.0, (0.25, 0.75), 3.0
 
 @dataclass(frozen=True)
 class _Dish:
-    """The targets of a pattern in polar coordinates: way_mm (N,) from the vertex along the meridian, azimuth (N,), reach_mm (N,)."""
+    """The targets of a pattern in polar coordinates: way_mm (N,) from the vertex along the meridian, azimuth (N,), reach_mm (N,).
+
+    limit: of the strain; room_mm: width and height that a piece should not exceed.
+    """
 
     pattern: Pattern
     focal_length_mm: float
@@ -45,6 +48,7 @@ class _Dish:
     azimuth: Array
     reach_mm: Array
     limit: float
+    room_mm: tuple[float, float]
 
     def within(self, inner: float, outer: float) -> Index:
         """Targets with centres from one way to another."""
@@ -62,13 +66,16 @@ class _Zone:
     owner: Index
 
 
-def dish_pieces(pattern: Pattern, largest_strain: float = LARGEST_STRAIN) -> tuple[Piece, ...]:
+def dish_pieces(
+    pattern: Pattern, largest_strain: float = LARGEST_STRAIN, room_mm: tuple[float, float] = (np.inf, np.inf)
+) -> tuple[Piece, ...]:
     """Cap and gores for a pattern on a paraboloid, without pieces that hold no target.
 
-    largest_strain: largest part by which any length in a target may be printed longer than it is on the surface. Raises PatternError
-    when a single target is already too large for that limit.
+    largest_strain: largest part by which any length in a target may be printed longer than it is on the surface; room_mm: width and
+    height of paper into which pieces should fit, where circles free of targets allow it. Raises PatternError when a single target is
+    already too large for the limit.
     """
-    dish = _dish(pattern, largest_strain)
+    dish = _dish(pattern, largest_strain, room_mm)
     edges = _free_circles(dish)
     cap = max((edge for edge in edges if _cap_fits(dish, edge)), default=0.0)
     pieces = [_cap(dish, cap)] if cap > 0 and len(dish.within(0, cap)) else []
@@ -91,7 +98,7 @@ def cut_targets(pieces: tuple[Piece, ...]) -> list[int]:
     return sorted(found)
 
 
-def _dish(pattern: Pattern, limit: float) -> _Dish:
+def _dish(pattern: Pattern, limit: float, room_mm: tuple[float, float]) -> _Dish:
     focal = pattern.surface.focal_length_mm
     if focal is None:
         raise PatternError("gores are made of a paraboloid; this pattern's surface is a plane")
@@ -108,7 +115,7 @@ def _dish(pattern: Pattern, limit: float) -> _Dish:
             f"beyond the limit of {limit:.2%}: take smaller targets, or allow {100 * least:.2g} percent or more"
         )
     azimuth = np.arctan2(pattern.center_mm[:, 1], pattern.center_mm[:, 0])
-    return _Dish(pattern, focal, rim, way, azimuth, reach, limit)
+    return _Dish(pattern, focal, rim, way, azimuth, reach, limit, room_mm)
 
 
 def _free_circles(dish: _Dish) -> list[float]:
@@ -122,6 +129,8 @@ def _free_circles(dish: _Dish) -> list[float]:
 
 
 def _cap_fits(dish: _Dish, edge: float) -> bool:
+    if 2 * edge > min(dish.room_mm):
+        return False
     inside = dish.within(0, edge)
     flat = np.column_stack([dish.way_mm[inside], np.zeros(len(inside))])
     return bool((1 - AroundVertex(dish.focal_length_mm).stretch(flat, dish.reach_mm[inside]) <= dish.limit).all())
@@ -139,13 +148,13 @@ def _cap(dish: _Dish, edge: float) -> Piece:
 def _next_zone(dish: _Dish, inner: float, edges: list[float]) -> _Zone:
     """The widest zone from `inner` on whose seams cut no target, or the narrowest with the fewest cut."""
     for outer in reversed(edges):
-        least = _fewest(dish, dish.within(inner, outer))
+        least = _fewest(dish, inner, outer)
         for count in range(least, least + MORE_GORES):
-            if not _too_narrow(dish, dish.within(inner, outer), count):
+            if not _too_long(dish, inner, outer, count) and not _too_narrow(dish, dish.within(inner, outer), count):
                 for zone in _zones(dish, inner, outer, count):
                     if not zone.seams.crossed:
                         return zone
-    for count in range(_fewest(dish, dish.within(inner, edges[0])), COUNTS[-1] + 1):
+    for count in range(_fewest(dish, inner, edges[0]), COUNTS[-1] + 1):
         zones = list(_zones(dish, inner, edges[0], count))
         if zones:
             return min(zones, key=lambda zone: len(zone.seams.crossed))
@@ -174,11 +183,21 @@ def _too_narrow(dish: _Dish, target: Index, count: int) -> bool:
     return bool(2 * np.pi * radius_mm(dish.way_mm[first], dish.focal_length_mm) / count < 2 * dish.reach_mm[first])
 
 
-def _fewest(dish: _Dish, target: Index) -> int:
-    """The fewest gores with straight seams that can keep the limit, each about the middle of its targets."""
+def _too_long(dish: _Dish, inner: float, outer: float, count: int) -> bool:
+    """Whether a gore is longer than the paper: its foot is an arc, whose ends lie lower than its middle."""
+    return outer - inner * np.cos(np.pi / count) > dish.room_mm[1]
+
+
+def _fewest(dish: _Dish, inner: float, outer: float) -> int:
+    """The fewest gores with straight seams that can keep the limit and the paper's width, each about the middle of its targets."""
+    target = dish.within(inner, outer)
     radius = radius_mm(dish.way_mm[target], dish.focal_length_mm)
     gauss = 1 / (4 * dish.focal_length_mm**2) / (1 + radius**2 / (4 * dish.focal_length_mm**2)) ** 2
+    # a winding seam on either side may make a gore wider
+    widest = 2 * np.pi * outer * (1 + ROOM)
     for count in COUNTS:
+        if widest / count > dish.room_mm[0] and count < COUNTS[-1]:
+            continue
         owner = np.floor(np.mod(dish.azimuth[target], 2 * np.pi) / (2 * np.pi) * count).astype(int)
         aside = radius * np.abs(np.sin(dish.azimuth[target] - _middles(dish.azimuth[target], owner, count)[owner]))
         # winding seams can do a little better than straight ones

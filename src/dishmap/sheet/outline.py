@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from dishmap.sheet.pieces import TAB_MM, Piece
 from dishmap.sheet.shapes import Line, Words
@@ -13,7 +14,7 @@ Flags = NDArray[np.bool_]
 
 TAB_POINTS = 73
 # Letters of a piece's name, the step of the search for a free place for it, and free paper around it.
-NAME_MM, NAME_STEP_MM, NAME_MARGIN_MM = 2.0, 2.0, 1.0
+NAME_MM, NAME_STEP_MM, NAME_MARGIN_MM = 2.0, 3.0, 1.0
 # Width of a letter over its height in Helvetica, for the longest of words.
 LETTER_WIDTH = 0.8
 
@@ -45,11 +46,11 @@ def name_words(piece: Piece, low: Array, high: Array) -> list[Words]:
     along = np.linspace(0, 1, 5)
     box = np.stack(np.meshgrid(along * width, np.array([0.0, 1.0]) * NAME_MM), axis=-1).reshape(-1, 2)
     points = corner[:, None] + box
-    free = inside(points.reshape(-1, 2), piece.outline_mm).reshape(len(corner), -1).all(axis=1)
     marks = np.concatenate([piece.outline_mm, *(line.points_mm for line in piece.extra if isinstance(line, Line))])
-    free &= np.linalg.norm(points[:, :, None] - marks, axis=-1).min(axis=(1, 2)) > NAME_MARGIN_MM
+    free = cKDTree(marks).query(points.reshape(-1, 2))[0].reshape(points.shape[:2]).min(axis=1) > NAME_MARGIN_MM
     for x_mm, y_mm, radius in piece.keep_mm:
         free &= np.linalg.norm(points - np.array([x_mm, y_mm]), axis=-1).min(axis=1) > radius + NAME_MARGIN_MM
+    free[free] = inside(points[free].reshape(-1, 2), piece.outline_mm).reshape(-1, len(box)).all(axis=1)
     if not free.any():
         return []
     best = corner[free][np.argmin(np.linalg.norm(corner[free] - piece.anchor_mm, axis=1))]

@@ -88,7 +88,7 @@ def pattern_sheets(
             raise InputError("corner marks belong to flat patterns and boards; a dish has no corners: leave them out")
         if not 0 < largest_strain < 1:
             raise InputError(f"the largest strain must lie between 0 and 100 percent, not {100 * largest_strain:g}")
-        pieces = dish_pieces(pattern, largest_strain)
+        pieces = dish_pieces(pattern, largest_strain, (float(paper.room_mm.min()), float(paper.room_mm.max())))
     else:
         plate = flat_piece(pattern.name or "pattern", pattern, Flat(), np.arange(len(pattern)), None, np.zeros(2))
         piece, marks = _with_corner_marks(plate, corner_marks)

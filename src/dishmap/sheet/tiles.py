@@ -18,7 +18,7 @@ Index = NDArray[np.int64]
 # Each tile is printed beyond its cuts by this, to be glued under its neighbour, unless another overlap is given.
 OVERLAP_MM = 10.0
 # Free paper between a cut and the ink.
-CLEARANCE_MM = 0.3
+CLEARANCE_MM, ROUNDING_MM = 0.3, 1e-9
 # A cut that avoids the ink makes a tile smaller, but not by more than this part.
 SMALLEST_PART = 0.4
 # More sheets than this are a mistake in the units.
@@ -101,18 +101,21 @@ def _walk(low: float, high: float, room: float, overlap: float, center: Array, r
     start, last = low, low
     while high - start > room:
         most = start + room - overlap
-        cut = most
-        while True:
-            hit = np.abs(center - cut) < reach - 1e-9
-            if not hit.any():
-                break
-            cut = float((center - reach)[hit].min())
-            if cut < last + SMALLEST_PART * (most - last):
-                cut = most
-                break
+        cut = _free_cut(last + SMALLEST_PART * (most - last), most, center, reach)
         cuts.append(cut)
         start, last = cut - overlap, cut
     return cuts
+
+
+def _free_cut(least: float, most: float, center: Array, reach: Array) -> float:
+    """The last place from `least` to `most` that meets nothing (c,) within reach, as near to the middle of its gap as can be; or `most`."""
+    cut = most
+    while (hit := np.abs(center - cut) < reach - ROUNDING_MM).any():
+        cut = float((center - reach)[hit].min())
+        if cut < least:
+            return most
+    before, after = (center + reach)[center < cut], (center - reach)[center > cut]
+    return float(np.clip((before.max(initial=least) + after.min(initial=max(most, cut))) / 2, least, most))
 
 
 def _tile(piece: Piece, row: int, column: int, cut_low: Array, cut_high: Array, grow: Array) -> Tile:

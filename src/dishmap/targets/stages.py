@@ -251,7 +251,7 @@ def coarse_fit(image: NDArray[Any], group: Group, ink: Ink) -> Coarse:
     first = adjust(batch, pixels, group.poses, group.state, Weighting(1.0, 0.0, None), FIRST_STEPS)
     blur = float(np.median(first.state.blur_px))
     if blur > FIRST_BAND_BLUR_PX and np.isfinite(first.poses.position_mm).all():
-        # rings less sharp than that may need another model, or else they would seem to show a tone curve
+        # what a blurred ring sees of its neighbours, or a model too simple for it, would pass for a tone curve
         batch, pixels = _coarse_layout(image, replace(group, poses=first.poses, state=first.state), ink, blur, blur)
         first = adjust(batch, pixels, first.poses, first.state, Weighting(1.0, 0.0, None), FIRST_STEPS)
     cut = residual_cut(first, pixels)
