@@ -18,7 +18,6 @@ from dishmap.compare import (
     later_hint,
     measure_state,
 )
-from dishmap.difference.changes import TARGET_COLUMNS
 from dishmap.difference.paper import Centers
 from dishmap.difference.priors import Priors
 from dishmap.errors import FitError, InputError, MeasurementError
@@ -29,7 +28,7 @@ from dishmap.simulate.scene import Scene, Sensor, facing_pose
 from dishmap.surface.fit import Basis
 from dishmap.targets.builders import dish, plate
 from dishmap.targets.identify import PoseGuess, Upright
-from dishmap.targets.pose import TargetPoses
+from dishmap.targets.pose import TARGET_COLUMNS, TargetPoses
 
 CAMERA = Camera(640, 480, [800.0, 800.0], [319.5, 239.5], [-0.1, 0.02, 0.0, 0.0])
 PLATE = plate(4, 5, 40.0)

@@ -315,18 +315,17 @@ def _fitted_centers(poses: TargetPoses, camera: Camera) -> Centers:
 def _joint_surface(joint: DifferenceMap, name: str, basis: Basis) -> SurfaceFit:
     """Robust surface (the paper's Algorithm 4, unweighted) through displacement or shape over x, y.
 
-    Neighbouring values share their errors, so the covariance of the coefficients comes from that of all values together. That of the
-    whole displacement is not known (the estimate gives that of its shape and of its rigid motion, not how they go together): NaN.
+    Neighbouring values share their errors, so the covariance of the coefficients comes from that of all values together.
     """
-    value = joint.shape_mm if name == SHAPE else joint.displacement_mm
+    of_shape = name == SHAPE
+    value = joint.shape_mm if of_shape else joint.displacement_mm
     fit = fit_surface(_over_dish(joint, value), basis, weighted=False)
-    if name != SHAPE:
-        return replace(fit, covariance=np.full_like(fit.covariance, np.nan))
     design = _design(fit, joint.nominal_mm[:, :2])
     heavy = fit.weights[:, None] * design
     by = np.linalg.solve(heavy.T @ design, heavy.T)
-    shared = by @ joint.shape_factor
-    return replace(fit, covariance=shared @ shared.T + (by * joint.shape_own_mm2) @ by.T)
+    shared = by @ (joint.shape_factor if of_shape else joint.displacement_factor)
+    own = joint.shape_own_mm2 if of_shape else joint.displacement_own_mm2
+    return replace(fit, covariance=shared @ shared.T + (by * own) @ by.T)
 
 
 def _over_dish(joint: DifferenceMap, value_mm: Array) -> PointCloud:

@@ -15,7 +15,7 @@ from dishmap.difference.priors import Priors
 from dishmap.errors import InputError, MeasurementError
 from dishmap.quality import Quality
 from dishmap.simulate.deform import Bump, Crease, Deformation, ZernikeTerm
-from dishmap.targets.pose import TargetPoses
+from dishmap.targets.pose import TargetPoses, select_targets
 from dishmap.transforms import Pose
 
 # Largest of 37 standard normals: 4.2 sigma is exceeded once in a thousand draws.
@@ -207,13 +207,10 @@ def test_the_error_comes_near_the_bound() -> None:
 
 
 def test_too_few_common_targets_are_refused() -> None:
-    from dishmap.difference.changes import TARGET_COLUMNS
-
     whole = state()
 
     def part(rows: slice) -> TargetPoses:
-        columns = {name: getattr(whole, name)[rows] for name in TARGET_COLUMNS}
-        return replace(whole, **columns)  # type: ignore[arg-type]
+        return select_targets(whole, np.arange(len(whole))[rows])
 
     with pytest.raises(MeasurementError, match="at least 3"):
         joint_difference(part(slice(0, 20)), part(slice(18, None)), CAMERA, DISH)

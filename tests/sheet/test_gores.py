@@ -19,7 +19,7 @@ from dishmap.sheet.flatten import AlongMeridian, AroundVertex, meridian_mm, radi
 from dishmap.sheet.gores import cut_targets, dish_pieces
 from dishmap.sheet.outline import inside
 from dishmap.sheet.pieces import reach_mm
-from dishmap.targets.builders import dish, disc, multi_circular
+from dishmap.targets.builders import disc, dish, multi_circular
 from dishmap.targets.detect import find_ellipses
 from dishmap.targets.identify import identify
 from dishmap.targets.pattern import Pattern, Surface

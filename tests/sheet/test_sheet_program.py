@@ -19,7 +19,7 @@ from dishmap.sheet.markers import DICTIONARIES
 from dishmap.sheet.paper import Paper, paper_of
 from dishmap.sheet.pdf import pdf_bytes
 from dishmap.sheet.sheets import CORNER_MARKS, pattern_sheets
-from dishmap.targets.builders import dish, disc, plate
+from dishmap.targets.builders import disc, dish, plate
 from dishmap.targets.pattern import Pattern
 
 PLATE = ["plate", "--rows", 4, "--columns", 4, "--pitch-mm", 45]
@@ -158,9 +158,8 @@ def test_names_with_odd_letters_go_into_the_files(tmp_path: Path) -> None:
     assert done.exit_code == 0, (done.output, done.exception)
     assert "plate (Ø 3\\ <&> 漢" in SvgPage(tmp_path / "sheet-001.svg").words[-1]
     assert read_pattern(tmp_path / "pattern.json").name == "plate (Ø 3\\ <&> 漢"
-    assert (tmp_path / "sheets.pdf").read_bytes().count(rb"/Title (plate \(\330 3\\\\ <&> ?)") + (
-        tmp_path / "sheets.pdf"
-    ).read_bytes().count("/Title (plate \\(Ø 3\\\\ <&> ?)".encode("cp1252"))
+    title = "/Title (plate \\(Ø 3\\\\ <&> ?)"
+    assert title.encode("cp1252") in (tmp_path / "sheets.pdf").read_bytes()
 
 
 def test_the_pdf_asks_for_no_scaling_and_is_well_formed() -> None:

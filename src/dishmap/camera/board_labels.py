@@ -18,6 +18,7 @@ from dishmap.camera.model import Camera
 from dishmap.errors import IdentityError
 from dishmap.targets.candidates import Candidates, mark_candidates
 from dishmap.targets.detect import Detections
+from dishmap.targets.ellipses import ellipse_matrices, invert_2x2
 from dishmap.targets.pattern import Pattern
 
 Array = NDArray[np.float64]
@@ -27,14 +28,18 @@ Index = NDArray[np.int64]
 MARK_NEIGHBOURS, IMAGE_NEIGHBOURS = 8, 9
 # An ellipse is where it is predicted within this part of the distance between marks, at the start and from good neighbours.
 START_TOLERANCE, GROW_TOLERANCE = 0.25, 0.2
-# A local map is through so many labels; sizes agree with it to this part.
+# A local map is through so many labels; the half axes of circles agree with it to this part.
 LOCAL_LABELS, SIZE_TOLERANCE = 6, 0.3
+# Of all labels this part lies within so much of the distance between marks from where the labels around it say.
+FIT_QUANTILE, FIT_TOLERANCE = 0.75, 0.06
 # A seed explains this part of a mark's neighbours; so many seeds are grown before the board is given up.
 SEED_PART, MOST_SEEDS, SEED_ELLIPSES = 0.7, 12, 24
 FEWEST_LABELS = 12
 MOST_ROUNDS = 200
 # Another way to lay the board must explain this many labels less: one that is hidden or stained must not decide.
 DECISIVE = 3
+# Ways that carry this part of the labels onto marks are grown, so many at most, and again as long as more is labelled.
+MOVE_PART, MOST_MOVES, MOST_LAYINGS = 0.6, 48, 6
 # Half angle of a nominal camera, for what depends on one hardly: which ellipses have what inside.
 NOMINAL_FOCAL = 1.2
 
@@ -60,7 +65,7 @@ def label_board(detections: Detections, pattern: Pattern, width_px: int, height_
             f"only {len(usable)} of {len(detections)} ellipses look like marks of the board {pattern.name!r}, and at least {FEWEST_LABELS} "
             "are needed; check focus and exposure, and that this is the printed board"
         )
-    board = _Board(pattern, candidates.take(usable))
+    board = _Board(pattern, detections, candidates.take(usable))
     match = board.best_growth()
     if (match >= 0).sum() < FEWEST_LABELS:
         raise IdentityError(
@@ -75,11 +80,13 @@ def label_board(detections: Detections, pattern: Pattern, width_px: int, height_
 class _Board:
     """Marks and ellipses of one search; labels are an array with the ellipse of each mark, or -1."""
 
-    def __init__(self, pattern: Pattern, candidates: Candidates) -> None:
+    def __init__(self, pattern: Pattern, detections: Detections, candidates: Candidates) -> None:
         marks = pattern.marks
         self.name, self.candidates = pattern.name, candidates
         self.xy, self.radius, self.type = marks.center_mm[:, :2], marks.radius_mm, marks.type_index
         self.uv, self.size, self.is_type = candidates.center_px, candidates.size_px, candidates.is_type
+        half = ellipse_matrices(detections.semi_axes_px, detections.angle_rad)[candidates.detection]
+        self.shape = invert_2x2(half @ np.swapaxes(half, 1, 2))
         self.tree = cKDTree(self.uv)
         count = min(MARK_NEIGHBOURS + 1, len(self.xy))
         distance, self.near = cKDTree(self.xy).query(self.xy, k=count)
@@ -95,7 +102,7 @@ class _Board:
             for seed in self._seeds(int(ellipse)):
                 match = self._grown(seed)
                 grown += 1
-                if (match >= 0).sum() > (best >= 0).sum():
+                if (match >= 0).sum() > (best >= 0).sum() and self._fits(match):
                     best = match
                 if (best >= 0).sum() > 0.8 * enough or grown >= MOST_SEEDS:
                     return best
@@ -125,13 +132,19 @@ class _Board:
             off, hit = self.tree.query(predicted)
             fits = off < START_TOLERANCE * self.spacing[mark] * scale[:, None]
             fits &= self.is_type[hit, self.type[self.near[mark][1:]]]
-            size = scale * self.radius[mark]
-            fits &= (np.abs(np.log(self.size[ellipse] / size)) < SIZE_TOLERANCE)[:, None]
+            fits &= self._same_shape(ellipse, self.radius[mark] * maps)[:, None]
             part = fits.mean(axis=1)
             i = int(np.argmax(part - 1e-3 * np.where(fits, off, 0).mean(axis=1) / (scale * self.spacing[mark])))
             if part[i] >= SEED_PART:
                 scores.append((float(part[i]), mark, maps[i]))
         return [self._seed(ellipse, mark, local) for _, mark, local in sorted(scores, key=lambda s: -s[0])[:2]]
+
+    def _same_shape(self, ellipse: int, maps: Array) -> NDArray[np.bool_]:
+        """Whether maps (M, 2, 2) make the ellipse of the unit circle. A lattice looks the same after a shear; its circles do not."""
+        ratio = self.shape[ellipse] @ (maps @ np.swapaxes(maps, 1, 2))
+        half, product = 0.5 * np.trace(ratio, axis1=1, axis2=2), np.linalg.det(ratio)
+        largest = half + np.sqrt(np.maximum(half**2 - product, 0.0))
+        return np.asarray(np.maximum(largest, largest / np.maximum(product, 1e-9)) < np.exp(2 * SIZE_TOLERANCE))
 
     def _representatives(self, ellipse: int) -> Index:
         """Marks to try for an ellipse: those of its type, one for each arrangement of neighbours that is unlike the others."""
@@ -179,11 +192,20 @@ class _Board:
             match = _each_once(match)
         return match
 
-    def _predicted(self, match: Index, known: Index, marks: Index) -> tuple[Array, Array]:
-        """Where marks (N,) should be seen, (N, 2), and the scale there, by affine maps through the nearest labels."""
-        count = min(LOCAL_LABELS, len(known))
-        _, near = cKDTree(self.xy[known]).query(self.xy[marks], k=count)
-        near = known[near.reshape(len(marks), count)]
+    def _fits(self, match: Index) -> bool:
+        """Whether labels lie where their neighbours say: groups of rings one ring further do so only roughly."""
+        known = np.flatnonzero(match >= 0)
+        if len(known) <= LOCAL_LABELS:
+            return False
+        predicted, scale = self._predicted(match, known, known, skip=1)
+        off = np.linalg.norm(predicted - self.uv[match[known]], axis=1) / (scale * self.spacing[known])
+        return bool(np.nanquantile(off, FIT_QUANTILE) < FIT_TOLERANCE)
+
+    def _predicted(self, match: Index, known: Index, marks: Index, skip: int = 0) -> tuple[Array, Array]:
+        """Where marks (N,) should be seen, (N, 2), and the scale there, by affine maps through the nearest labels; skip=1: not their own."""
+        count = min(LOCAL_LABELS, len(known) - skip)
+        _, near = cKDTree(self.xy[known]).query(self.xy[marks], k=count + skip)
+        near = known[near.reshape(len(marks), count + skip)[:, skip:]]
         local = np.concatenate([self.xy[near] - self.xy[marks][:, None], np.ones((len(marks), count, 1))], axis=-1)
         # units of the spacing, and a touch of damping for labels in one line
         local[..., :2] /= self.spacing[marks][:, None, None]
@@ -196,23 +218,34 @@ class _Board:
 
     def settled(self, match: Index) -> Index:
         """The labels laid the one best way over the board. Raises IdentityError when there is no such way."""
-        marks = np.flatnonzero(match >= 0)
-        moves = self._moves(marks)
-        worth = np.array([self._explained(match, marks, *move) for move in moves])
-        order = np.argsort(-worth, kind="stable")
-        close = [int(i) for i in order if worth[i] > worth[order[0]] - DECISIVE]
-        if len(close) > 1 and not all(self._is_symmetry(*moves[i], *moves[close[0]]) for i in close):
-            raise IdentityError(
-                f"the board {self.name!r} could lie in {len(close)} ways over the {len(marks)} circles seen; show all of it, "
-                "or print it with orientation marks"
-            )
-        best = min(close, key=lambda i: self._turn(match, marks, *moves[i]))
+        for _ in range(MOST_LAYINGS):
+            marks = np.flatnonzero(match >= 0)
+            moves = self._moves(marks)
+            worth = np.array([self._explained(match, marks, *move) for move in moves])
+            order = [int(i) for i in np.argsort(-worth, kind="stable")[:MOST_MOVES] if worth[i] >= MOVE_PART * worth.max()]
+            # what lies beyond the part labelled so far decides between moves that carry all of it onto marks
+            grown = [self._grown(self._laid(match, marks, *moves[i])) for i in order]
+            count = np.array([(g >= 0).sum() if self._fits(g) else 0 for g in grown])
+            close = [k for k in np.argsort(-count, kind="stable") if count[k] > count.max() - DECISIVE]
+            best = min(close, key=lambda k: self._turn(match, marks, *moves[order[k]]))
+            settled = count[best] <= len(marks)
+            if settled and not all(self._is_symmetry(*moves[order[k]], *moves[order[best]]) for k in close):
+                raise IdentityError(
+                    f"the board {self.name!r} could lie in {len(close)} ways over the {len(marks)} circles seen; show all of it, "
+                    "or print it with orientation marks"
+                )
+            match = grown[best]
+            if settled:
+                break
+        return match
+
+    def _laid(self, match: Index, marks: Index, turn: Array, shift: Array) -> Index:
+        """The labels after a move, without those that do not look like their new marks."""
         moved = np.full(len(self.xy), -1)
-        hit, onto = self._onto(*moves[best], marks)
+        hit, onto = self._onto(turn, shift, marks)
+        hit &= self.is_type[match[marks], self.type[onto]]
         moved[onto[hit]] = match[marks[hit]]
-        agree = self.is_type[moved[moved >= 0], self.type[moved >= 0]]
-        moved[np.flatnonzero(moved >= 0)[~agree]] = -1
-        return self._grown(moved)
+        return moved
 
     def _moves(self, marks: Index) -> list[tuple[Array, Array]]:
         """Turns (2, 2) and shifts (2,) of the board's plane that carry a labelled mark and its nearest neighbour onto marks."""

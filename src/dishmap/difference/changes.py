@@ -17,7 +17,7 @@ from dishmap.camera.model import Camera
 from dishmap.difference.response import pose_response
 from dishmap.errors import MeasurementError
 from dishmap.targets.pattern import Pattern
-from dishmap.targets.pose import TargetPoses
+from dishmap.targets.pose import TARGET_COLUMNS, TargetPoses, select_targets
 from dishmap.transforms import Pose, rotation_from_vector
 
 Array = NDArray[Any]
@@ -78,7 +78,7 @@ def combine_frames(frames: list[TargetPoses]) -> TargetPoses:
 def _merged(a: TargetPoses, b: TargetPoses) -> TargetPoses:
     _, in_a, in_b = np.intersect1d(a.index, b.index, return_indices=True)
     only = np.setdiff1d(np.arange(len(b)), in_b)
-    shift = _between(_rows(a, in_a), _rows(b, in_b))
+    shift = _between(select_targets(a, in_a), select_targets(b, in_b))
     pull_b = b.pull[in_b] + np.einsum("nij,nj->ni", b.information[in_b], shift)
     information = a.information.copy()
     information[in_a] += b.information[in_b]
@@ -114,13 +114,6 @@ def _merged(a: TargetPoses, b: TargetPoses) -> TargetPoses:
     return replace(a, **{name: values[order] for name, values in columns.items()})
 
 
-# The fields of TargetPoses with one row for each target.
-TARGET_COLUMNS = (
-    *("index", "ids", "position_mm", "normal", "rotation", "covariance", "information", "pull", "prior", "center_px", "covariance_px2"),
-    *("sigma_normal_rad", "calibration_jacobian", "blur_px", "offset_mm", "contrast", "noise", "kept", "quality"),
-)
-
-
 def _averaged_centers(a: TargetPoses, b: TargetPoses, in_a: Index, in_b: Index) -> dict[str, Array]:
     center, covariance = a.center_px.copy(), a.covariance_px2.copy()
     first, second = np.linalg.inv(a.covariance_px2[in_a]), np.linalg.inv(b.covariance_px2[in_b])
@@ -128,11 +121,6 @@ def _averaged_centers(a: TargetPoses, b: TargetPoses, in_a: Index, in_b: Index) 
     covariance[in_a] = both
     center[in_a] = np.einsum("nij,nj->ni", both @ first, a.center_px[in_a]) + np.einsum("nij,nj->ni", both @ second, b.center_px[in_b])
     return {"center_px": center, "covariance_px2": covariance}
-
-
-def _rows(poses: TargetPoses, rows: Index) -> TargetPoses:
-    columns: dict[str, Any] = {name: getattr(poses, name)[rows] for name in TARGET_COLUMNS}
-    return replace(poses, **columns)
 
 
 def _between(a: TargetPoses, b: TargetPoses) -> Array:
@@ -200,7 +188,7 @@ def _kabsch(a: Array, b: Array) -> Pose:
 def target_changes(reference: TargetPoses, current: TargetPoses, camera: Camera, pattern: Pattern) -> TargetChanges:
     """How every target that both states show moved. Raises MeasurementError when they have fewer than LEAST_TARGETS in common."""
     _, in_reference, in_current = np.intersect1d(reference.index, current.index, return_indices=True)
-    before, after = _rows(reference, in_reference), _rows(current, in_current)
+    before, after = select_targets(reference, in_reference), select_targets(current, in_current)
     covariance = before.covariance[:, :3, :3] + after.covariance[:, :3, :3]
     moved = rigid_alignment(before.position_mm, after.position_mm, covariance)
     aligned = replace(before, position_mm=moved.apply(before.position_mm), rotation=moved.rotation @ before.rotation)

@@ -77,7 +77,8 @@ def dish_pieces(
     """
     dish = _dish(pattern, largest_strain, room_mm)
     edges = _free_circles(dish)
-    cap = max((edge for edge in edges if _cap_fits(dish, edge)), default=0.0)
+    empty = max((edge for edge in edges if not len(dish.within(0, edge))), default=0.0)
+    cap = max((edge for edge in edges if _cap_fits(dish, edge)), default=empty)
     pieces = [_cap(dish, cap)] if cap > 0 and len(dish.within(0, cap)) else []
     inner, number = cap, 0
     while inner < edges[-1]:
@@ -119,13 +120,15 @@ def _dish(pattern: Pattern, limit: float, room_mm: tuple[float, float]) -> _Dish
 
 
 def _free_circles(dish: _Dish) -> list[float]:
-    """Ways from the vertex at which a circle meets no target, in the middle of each gap, and the rim last."""
+    """Ways from the vertex at which a circle meets no target: before the first one, amid gaps, behind the last, and the rim."""
     low, high = dish.way_mm - dish.reach_mm, dish.way_mm + dish.reach_mm
     order = np.argsort(low)
     reached = np.maximum.accumulate(high[order])
     gap = low[order][1:] - reached[:-1]
     middle = (low[order][1:] + reached[:-1]) / 2
-    return [*(float(m) for m in middle[(gap > 2 * CLEARANCE_MM) & (middle > 0)]), dish.rim_mm]
+    first, last = float(low.min()) - 2 * CLEARANCE_MM, float(high.max()) + 2 * CLEARANCE_MM
+    inner = [first, *(float(m) for m in middle[gap > 2 * CLEARANCE_MM]), last]
+    return [*(edge for edge in inner if 0 < edge < dish.rim_mm), dish.rim_mm]
 
 
 def _cap_fits(dish: _Dish, edge: float) -> bool:
@@ -213,7 +216,8 @@ def _middles(azimuth: Array, owner: Index, count: int) -> Array:
     low, high = np.full(count, np.inf), np.full(count, -np.inf)
     np.minimum.at(low, owner, turn)
     np.maximum.at(high, owner, turn)
-    return np.asarray(middle + np.where(np.isfinite(low), (low + high) / 2, 0.0))
+    held = np.isfinite(low)
+    return np.asarray(middle + np.where(held, low, 0.0) / 2 + np.where(held, high, 0.0) / 2)
 
 
 def _owners(dish: _Dish, target: Index, seams: Seams) -> Index:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from dishmap.errors import InputError
 from dishmap.sheet.paper import words_of
@@ -23,8 +25,8 @@ CLEARANCE_MM, ROUNDING_MM = 0.3, 1e-9
 SMALLEST_PART = 0.4
 # More sheets than this are a mistake in the units.
 LARGEST_PAGES = 400
-# Crosses on the cuts, which both neighbours show, lie this far apart or more, with arms of this length.
-CROSS_STEP_MM, CROSS_ARM_MM = 40.0, 2.5
+# Crosses on the cuts, which both neighbours show, lie this far apart or more, at the first free one of places so close; their arms.
+CROSS_STEP_MM, CROSS_TRY_MM, CROSS_ARM_MM = 40.0, 2.0, 2.5
 
 
 @dataclass(frozen=True)
@@ -132,20 +134,30 @@ def _tile(piece: Piece, row: int, column: int, cut_low: Array, cut_high: Array, 
 def _crosses(piece: Piece, edges: list[list[float]]) -> Array:
     """Places (c, 2) on the cuts that are free of ink, at the meetings of cuts and borders and every CROSS_STEP_MM between them."""
     found: list[Array] = []
+    free = _free_of(piece.keep_mm)
     for axis in (0, 1):
         other = 1 - axis
-        along = np.arange(edges[other][0], edges[other][-1], 2.0)
+        along = np.array([*edges[other], *np.arange(edges[other][0], edges[other][-1], CROSS_TRY_MM)])
         for cut in edges[axis][1:-1]:
-            places = np.empty((len(along) + len(edges[other]), 2))
-            places[:, axis] = cut
-            places[:, other] = [*edges[other], *along]
-            for place in places[_free(places, piece.keep_mm)]:
-                if all(np.linalg.norm(place - known) >= CROSS_STEP_MM for known in found):
-                    found.append(place)
-    return np.array(found).reshape(-1, 2)
+            places = np.empty((len(along), 2))
+            places[:, axis], places[:, other] = cut, along
+            taken = np.zeros((0, 2))
+            for place in places[free(places)]:
+                near = np.linalg.norm(taken - place, axis=1).min(initial=np.inf)
+                if near >= CROSS_STEP_MM:
+                    taken = np.vstack([taken, place])
+            found.append(taken)
+    return np.unique(np.round(np.concatenate([np.zeros((0, 2)), *found]), 6), axis=0)
 
 
-def _free(places: Array, keep: Array) -> NDArray[np.bool_]:
+def _free_of(keep: Array) -> Callable[[Array], NDArray[np.bool_]]:
+    """A function that says which places (N, 2) have room for a cross."""
     if not len(keep):
-        return np.ones(len(places), dtype=bool)
-    return np.asarray((np.linalg.norm(places[:, None] - keep[:, :2], axis=-1) > keep[:, 2] + CROSS_ARM_MM).all(axis=1))
+        return lambda places: np.ones(len(places), dtype=bool)
+    tree, reach = cKDTree(keep[:, :2]), keep[:, 2] + CROSS_ARM_MM
+
+    def free(places: Array) -> NDArray[np.bool_]:
+        near = tree.query_ball_point(places, float(reach.max()))
+        return np.array([all(np.linalg.norm(keep[hits, :2] - p, axis=1) > reach[hits]) for p, hits in zip(places, near, strict=True)])
+
+    return free

@@ -19,6 +19,7 @@ from dishmap.errors import CameraError, ImageError, MeasurementError
 from dishmap.quality import Quality, is_rejected, names
 from dishmap.targets.adjust import Adjusted, Priors, by_target, prior_terms
 from dishmap.targets.detect import Detections
+from dishmap.targets.edges import Poses
 from dishmap.targets.identify import Identity
 from dishmap.targets.neighbours import Ink
 from dishmap.targets.pattern import Pattern
@@ -40,6 +41,7 @@ from dishmap.targets.stages import (
     printed_ink,
     regroup,
     start_groups,
+    tracked_groups,
     wholly_inside,
 )
 from dishmap.targets.start import centers_of
@@ -49,6 +51,8 @@ Array = NDArray[Any]
 Index = NDArray[np.int64]
 
 SMALLEST_RADIUS_PX = 2.0
+# How far a tracked target may have moved in the image, and the share of targets that must be found again.
+TRACKED_PX, TRACKED_SHARE = 3.0, 0.5
 # Sums of squares of larger grey levels leave the range of single precision.
 LARGEST_GREY = 1e15
 # Share of an edge that must be left for a target to be measured.
@@ -129,22 +133,69 @@ def measure_targets(
     # thousands of small matrix products: threads would cost more than they bring, far more on a busy machine
     # what overflows belongs to a target that the fit left, which is then rejected
     with threadpool_limits(limits=1, user_api="blas"), np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        return _measure(image, camera, pattern, detections, identity, assumptions or Assumptions(), progress or (lambda done, total: None))
+        assumptions = assumptions or Assumptions()
+        groups, rejected = start_groups(camera, pattern, detections, identity, assumptions)
+        tell = progress or (lambda done, total: None)
+        return _measure(image, camera, pattern, groups, rejected, identity.camera_from_dish, assumptions, tell)
+
+
+def track_targets(
+    image: NDArray[Any], camera: Camera, pattern: Pattern, reference: TargetPoses, assumptions: Assumptions | None = None
+) -> TargetPoses:
+    """Measure the targets of an earlier photograph of the same scene again, each looked for where it was.
+
+    No search and no naming: a target may have moved by up to TRACKED_PX in the image and keeps its name. Targets that moved farther are
+    listed in `rejected`; when fewer than half are found again, the whole is refused. Raises as `measure_targets`.
+    """
+    check_image(image, camera)
+    assumptions = assumptions or Assumptions()
+    with threadpool_limits(limits=1, user_api="blas"):
+        before = Poses(reference.rotation, reference.position_mm)
+        groups, rejected = tracked_groups(camera, pattern, reference.index, before, assumptions)
+        found = _measure(image, camera, pattern, groups, rejected, reference.camera_from_dish, assumptions, lambda done, total: None)
+    return _found_again(found, reference)
+
+
+def _found_again(found: TargetPoses, reference: TargetPoses) -> TargetPoses:
+    """Without the targets that are no longer where they were: what was measured there may be something else."""
+    at = np.searchsorted(reference.index, found.index)
+    motion = np.linalg.norm(found.center_px - reference.center_px[at], axis=1)
+    near = motion < TRACKED_PX
+    if near.sum() < TRACKED_SHARE * len(reference):
+        raise MeasurementError(
+            f"only {int(near.sum())} of {len(reference)} targets were found again within {TRACKED_PX:g} px of where the reference has them; "
+            "the camera or the surface moved too far to track: measure the photograph on its own"
+        )
+    lost = tuple((int(i), f"it moved by more than {TRACKED_PX:g} px, or something else lies where it was") for i in found.ids[~near])
+    return replace(select_targets(found, np.flatnonzero(near)), rejected=tuple(sorted(found.rejected + lost)))
+
+
+# The fields of TargetPoses with one row for each target.
+TARGET_COLUMNS = (
+    *("index", "ids", "position_mm", "normal", "rotation", "covariance", "information", "pull", "prior", "center_px", "covariance_px2"),
+    *("sigma_normal_rad", "calibration_jacobian", "blur_px", "offset_mm", "contrast", "noise", "kept", "quality"),
+)
+
+
+def select_targets(poses: TargetPoses, rows: Index) -> TargetPoses:
+    """The targets in rows (K,) of a measurement."""
+    columns: dict[str, Any] = {name: getattr(poses, name)[rows] for name in TARGET_COLUMNS}
+    return replace(poses, **columns)
 
 
 def _measure(
     image: NDArray[Any],
     camera: Camera,
     pattern: Pattern,
-    detections: Detections,
-    identity: Identity,
+    groups: list[Group],
+    rejected: list[tuple[int, str]],
+    camera_from_dish: Pose,
     assumptions: Assumptions,
     tell: Callable[[int, int], None],
 ) -> TargetPoses:
-    groups, rejected = start_groups(camera, pattern, detections, identity, assumptions)
     total = 2 * len(groups)
     coarse = []
-    ink = printed_ink(camera, pattern, groups, identity.camera_from_dish)
+    ink = printed_ink(camera, pattern, groups, camera_from_dish)
     for group in groups:
         fit = _coarse_fit(image, pattern, group, ink, rejected)
         coarse += [] if fit is None else [fit]
@@ -153,7 +204,7 @@ def _measure(
         raise MeasurementError(
             "no named target lies wholly inside the image; move the camera back or turn it so that whole targets are seen"
         )
-    shared = learn(camera, pattern, identity.camera_from_dish, coarse, assumptions)
+    shared = learn(camera, pattern, camera_from_dish, coarse, assumptions)
     ink = printed_ink(camera, pattern, [fit.group for fit in coarse], shared.camera_from_dish)
     fits = []
     for fit in coarse:

@@ -158,6 +158,25 @@ def start_groups(
     return groups, rejected
 
 
+def tracked_groups(
+    camera: Camera, pattern: Pattern, index: Index, poses: Poses, assumptions: Assumptions
+) -> tuple[list[Group], list[tuple[int, str]]]:
+    """Targets number `index` (T,) at poses known beforehand, in groups; and (id, reason) of those that reach beyond the image."""
+    groups: list[Group] = []
+    rejected: list[tuple[int, str]] = []
+    names = np.array(pattern.kind_names)[index]
+    for name in np.unique(names):
+        rows = np.flatnonzero(names == name)
+        order = rows[np.argsort(np.linalg.norm(poses.position_mm[rows], axis=1), kind="stable")]
+        for part in np.array_split(order, -(-len(order) // GROUP_SIZE)):
+            group = _first_group(camera, pattern, pattern.kinds[str(name)], index[part], poses.take(part), assumptions)
+            inside = wholly_inside(group)
+            rejected += [(int(pattern.ids[i]), "it reaches beyond the image") for i in group.index[~inside]]
+            if inside.any():
+                groups.append(regroup(group, inside))
+    return groups, rejected
+
+
 def printed_ink(camera: Camera, pattern: Pattern, groups: list[Group], camera_from_dish: Pose) -> Ink:
     """Where the ink of all targets is: of the groups' at their poses, of the others on the undeformed pattern."""
     parts = [(group.kind, group.index, group.poses) for group in groups]
