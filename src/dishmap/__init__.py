@@ -27,7 +27,11 @@ if TYPE_CHECKING:
     from dishmap.io.images import read_gray
     from dishmap.io.measurement_file import read_measurement, write_measurement
     from dishmap.io.pattern_file import read_pattern, write_pattern
+    from dishmap.io.sheet_file import write_sheets
     from dishmap.pipeline import map_photograph
+    from dishmap.sheet.boards import charuco, chessboard
+    from dishmap.sheet.paper import paper_of
+    from dishmap.sheet.sheets import as_printed, board_sheets, pattern_sheets
     from dishmap.simulate.deform import Deformation
     from dishmap.simulate.render import simulate as simulate_photograph
     from dishmap.simulate.scene import Light, Scene, Sensor, facing_pose
@@ -60,7 +64,11 @@ _HOME = {
     "Surface": "dishmap.targets.pattern",
     "TargetKind": "dishmap.targets.pattern",
     "Upright": "dishmap.targets.identify",
+    "as_printed": "dishmap.sheet.sheets",
+    "board_sheets": "dishmap.sheet.sheets",
     "calibrate": "dishmap.camera.calibrate",
+    "charuco": "dishmap.sheet.boards",
+    "chessboard": "dishmap.sheet.boards",
     "compare_photographs": "dishmap.compare",
     "dish": "dishmap.targets.builders",
     "facing_pose": "dishmap.simulate.scene",
@@ -70,6 +78,8 @@ _HOME = {
     "identify": "dishmap.targets.identify",
     "map_photograph": "dishmap.pipeline",
     "measure_targets": "dishmap.targets.pose",
+    "paper_of": "dishmap.sheet.paper",
+    "pattern_sheets": "dishmap.sheet.sheets",
     "plate": "dishmap.targets.builders",
     "read_camera": "dishmap.io.camera_file",
     "read_difference": "dishmap.io.difference_file",
@@ -82,6 +92,7 @@ _HOME = {
     "write_camera": "dishmap.io.camera_file",
     "write_measurement": "dishmap.io.measurement_file",
     "write_pattern": "dishmap.io.pattern_file",
+    "write_sheets": "dishmap.io.sheet_file",
 }
 # `dishmap.simulate` is the package, so its function of that name goes by another one here.
 _OTHER_NAME = {"simulate_photograph": "simulate"}
@@ -103,7 +114,11 @@ __all__ = [
     "TargetKind",
     "Upright",
     "__version__",
+    "as_printed",
+    "board_sheets",
     "calibrate",
+    "charuco",
+    "chessboard",
     "compare_photographs",
     "dish",
     "facing_pose",
@@ -113,6 +128,8 @@ __all__ = [
     "identify",
     "map_photograph",
     "measure_targets",
+    "paper_of",
+    "pattern_sheets",
     "plate",
     "read_camera",
     "read_difference",
@@ -125,6 +142,7 @@ __all__ = [
     "write_camera",
     "write_measurement",
     "write_pattern",
+    "write_sheets",
 ]
 
 

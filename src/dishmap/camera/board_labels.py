@@ -30,8 +30,8 @@ MARK_NEIGHBOURS, IMAGE_NEIGHBOURS = 8, 9
 START_TOLERANCE, GROW_TOLERANCE = 0.25, 0.2
 # A local map is through so many labels; the half axes of circles agree with it to this part.
 LOCAL_LABELS, SIZE_TOLERANCE = 6, 0.3
-# Of all labels this part lies within so much of the distance between marks from where the labels around it say.
-FIT_QUANTILE, FIT_TOLERANCE = 0.75, 0.06
+# Labels that others surround (their middle is nearer than a part of the distance between marks) lie where these say, to another part.
+SURROUNDED, FEWEST_INNER, FIT_TOLERANCE = 0.4, 3, 0.06
 # A seed explains this part of a mark's neighbours; so many seeds are grown before the board is given up.
 SEED_PART, MOST_SEEDS, SEED_ELLIPSES = 0.7, 12, 24
 FEWEST_LABELS = 12
@@ -197,9 +197,14 @@ class _Board:
         known = np.flatnonzero(match >= 0)
         if len(known) <= LOCAL_LABELS:
             return False
-        predicted, scale = self._predicted(match, known, known, skip=1)
-        off = np.linalg.norm(predicted - self.uv[match[known]], axis=1) / (scale * self.spacing[known])
-        return bool(np.nanquantile(off, FIT_QUANTILE) < FIT_TOLERANCE)
+        _, near = cKDTree(self.xy[known]).query(self.xy[known], k=LOCAL_LABELS + 1)
+        around = self.xy[known][near[:, 1:]].mean(axis=1) - self.xy[known]
+        inner = known[np.linalg.norm(around, axis=1) < SURROUNDED * self.spacing[known]]
+        if len(inner) < FEWEST_INNER:
+            return False
+        predicted, scale = self._predicted(match, known, inner, skip=1)
+        off = np.linalg.norm(predicted - self.uv[match[inner]], axis=1) / (scale * self.spacing[inner])
+        return bool(np.nanmedian(off) < FIT_TOLERANCE)
 
     def _predicted(self, match: Index, known: Index, marks: Index, skip: int = 0) -> tuple[Array, Array]:
         """Where marks (N,) should be seen, (N, 2), and the scale there, by affine maps through the nearest labels; skip=1: not their own."""

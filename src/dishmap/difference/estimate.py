@@ -46,6 +46,8 @@ NOTED_MISFIT, LEAST_FREEDOM, SETTLED_SCALE = 4.0, 12.0, 0.05
 SPREAD: tuple[dict[str, float], ...] = ({"normal_mm": 2.5}, {"rough_mm": 5.0}, {"rough_mm": 20.0}, {"normal_mm": 2.5, "rough_mm": 5.0})
 # Slide beyond what a way says, as a mean strain: more than this is another way of moving.
 LARGEST_SLIDE = 5e-6
+# A surface that is rougher than this from target to target, or prints that stretch more on their own, are outliers in disguise.
+LARGEST = {"rough_mm": 0.1, "print_strain": 3e-4}
 # How far the surface may have moved when its slides say nothing of it.
 FREE_NORMAL_MM = 1.0
 
@@ -190,7 +192,7 @@ class _Problem:
             # what cannot be told from slides is not smoothed away
             names = [n for n in names if n != "normal_mm"]
             sizes = replace(sizes, normal_mm=max(sizes.normal_mm, FREE_NORMAL_MM))
-        bounds = {} if way == "any" else {"slide_strain": LARGEST_SLIDE}
+        bounds = LARGEST if way == "any" else {**LARGEST, "slide_strain": LARGEST_SLIDE}
         found = learn_sizes(lambda at: self.evidence(columns, at), sizes, names, bounds)
         return Hypothesis(way, length, columns, found.posterior, found.log_weight, found.converged)
 

@@ -117,16 +117,18 @@ class Kernel:
 
 
 def smooth_kernel(surfaces: Surfaces, length_mm: float) -> Kernel:
-    """Project a Matern 5/2 field (Rasmussen and Williams 2006, 4.2) of unit variance on the normal terms."""
+    """Project a Matern 5/2 field (Rasmussen and Williams 2006, 4.2) of unit variance, and a mean of unit variance, on the normal terms."""
     points = surfaces.points
     distance = cdist(points, points) * (np.sqrt(5) / length_mm)
     kernel = (1 + distance + distance**2 / 3) * np.exp(-distance)
     covariance = surfaces.projection @ kernel @ surfaces.projection.T
+    # a field that changes over short lengths has hardly any mean of its own, and nothing says that the surface did not rise as a whole
+    covariance[0, 0] += 1.0
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     # what is left out counts as unexplained
     keep = values > LEAST_MODE * values.max()
     root = vectors[:, keep] * np.sqrt(values[keep])
-    rise = 1 - ((surfaces.value @ root) ** 2).sum(axis=1)
+    rise = 2 - ((surfaces.value @ root) ** 2).sum(axis=1)
     # slopes of the field, mean of the two directions; a Matern 5/2 field has 5 / (3 length^2)
     slopes = 5 / (3 * length_mm**2) - 0.5 * ((surfaces.slope @ root) ** 2).sum(axis=(1, 2)) / surfaces.fields.radius_mm**2
     return Kernel(length_mm, root, np.maximum(np.stack([rise, slopes], axis=-1), 0))
