@@ -33,7 +33,7 @@ ROUNDING_PX = 1e-11
 CAUCHY_SIGMAS = 3.0
 # rms of one coordinate from the median length of 2D residuals: sqrt(2 ln 2)
 MEDIAN_OF_RAYLEIGH = 1.1774
-SMALLEST_SCALE_PX = 0.01
+SMALLEST_SCALE_PX = 0.002
 
 
 @dataclass(frozen=True)
@@ -255,7 +255,7 @@ def _cost(residuals: Array, weights: Array) -> float:
 
 
 def scale_px(residuals: Array) -> float:
-    """Robust sigma of one coordinate of 2D residuals (M, 2), px, never below a hundredth of a pixel."""
+    """Robust sigma of one coordinate of 2D residuals (M, 2), px, never below two thousandths of a pixel."""
     length = np.linalg.norm(residuals, axis=-1)
     length = np.where(np.isfinite(length), length, np.inf)
     return max(float(np.median(length)) / MEDIAN_OF_RAYLEIGH, SMALLEST_SCALE_PX)

@@ -103,7 +103,7 @@ def _own_options(command: click.Command) -> list[click.Parameter]:
 @sheet_group.command("plate", params=_own_options(plate_command))
 @_sheet_options
 def plate_sheet(rows: int, columns: int, pitch_mm: float, orientation_marks: bool, name: str, out: Path, **options: Any) -> None:
-    """Sheets of a flat plate of targets; options as of `dishmap pattern plate`."""
+    """Sheets of a flat plate of targets."""
     from dishmap.targets.builders import plate
 
     target, kind_name = _kind(**_without_sheet_options(options))
@@ -124,7 +124,7 @@ def dish_sheet(
     out: Path,
     **options: Any,
 ) -> None:
-    """Gores of a dish, to glue onto it or to cut stencils from; options as of `dishmap pattern dish`."""
+    """Gores of a dish, to glue on or to cut stencils from."""
     from dishmap.targets.builders import dish
 
     target, kind_name = _kind(**_without_sheet_options(options))
@@ -140,9 +140,7 @@ def dish_sheet(
 @click.option("--dictionary", type=click.Choice(DICTIONARIES), help="Of a ChArUco board's marks.  [default: 5x5_1000]")
 @click.option("--grid", type=Grid(), metavar="NxM", help="Circles or rings along x and y.")
 @click.option("--pitch-mm", type=POSITIVE, help="From circle to circle; of acircles, between neighbouring rows.")
-@click.option(
-    "--radius-mm", type=POSITIVE, help="Of a circle, or a ring's outer edge.  [default: 0.3 to 0.4 of the pitch]"
-)
+@click.option("--radius-mm", type=POSITIVE, help="Of a circle, or a ring's outer edge.  [default: 0.3 to 0.4 of the pitch]")
 @click.option("--inner-radius-mm", type=POSITIVE, help="Of a ring's hole.  [default: half of the outer one]")
 @click.option("--no-orientation-marks", is_flag=True, help="Let all circles or rings look alike.")
 @_sheet_options

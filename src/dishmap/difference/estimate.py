@@ -40,6 +40,8 @@ LIKE_MOST, USUAL_MISFIT = 0.75, 7.8
 # When more targets than this share would have to go, it is the surface that is strange, not they.
 LEAST_KEPT = 0.7
 OUTLIER_ROUNDS = 5
+# A way that will fall this far short of the best is not followed to its end.
+HOPELESS_NATS = 200.0
 # Residuals count as larger than claimed from this many standard deviations of their mean square; with this many degrees of freedom or more.
 NOTED_MISFIT, LEAST_FREEDOM, SETTLED_SCALE = 4.0, 12.0, 0.05
 # Sizes tried beside the learnt ones, as factors.
@@ -184,8 +186,8 @@ class _Problem:
         self.kept, self.loose = kept, loose
         return changed
 
-    def fit(self, way: str, length: float, start: Sizes | None = None) -> Hypothesis:
-        """Fit one way of moving."""
+    def fit(self, way: str, length: float, start: Sizes | None = None, beat: float = -np.inf) -> Hypothesis:
+        """Fit one way of moving; given up when it will fall far short of a log evidence `beat`."""
         columns, sizes = self.columns(way, length), start or self.start
         names = list(self.learnt)
         if way == "any":
@@ -193,7 +195,7 @@ class _Problem:
             names = [n for n in names if n != "normal_mm"]
             sizes = replace(sizes, normal_mm=max(sizes.normal_mm, FREE_NORMAL_MM))
         bounds = LARGEST if way == "any" else {**LARGEST, "slide_strain": LARGEST_SLIDE}
-        found = learn_sizes(lambda at: self.evidence(columns, at), sizes, names, bounds)
+        found = learn_sizes(lambda at: self.evidence(columns, at), sizes, names, bounds, beat - HOPELESS_NATS)
         return Hypothesis(way, length, columns, found.posterior, found.log_weight, found.converged)
 
     def solve(self, tell: Callable[[int, int], None]) -> JointEstimate:
@@ -204,7 +206,7 @@ class _Problem:
         total = len(ways) + len(lengths)
         every = []
         for way in ways:
-            every.append(self.fit(way, middle))
+            every.append(self.fit(way, middle, beat=max((h.log_weight for h in every), default=-np.inf)))
             tell(len(every), total)
         every = self._without_outliers(_finite(every), middle)
         best = max(h.log_weight for h in every)

@@ -196,6 +196,8 @@ PRIOR_FOLDS, LARGEST_FOLDS = 4.0, 2.0
 # Settled: another step changes the log evidence by less than this, and no coefficient by more than this share of its sigma.
 SETTLED_NATS, SETTLED_SIGMAS = 0.2, 0.1
 LEARN_STEPS = 40
+# Steps converge at least geometrically: what is left to gain is less than this many times the last gain.
+STEPS_AHEAD = 20.0
 
 
 @dataclass(frozen=True)
@@ -208,11 +210,16 @@ class Learnt:
 
 
 def learn_sizes(
-    evidence_at: Callable[[Posterior | None], Evidence], start: Sizes, names: Sequence[str], largest: Mapping[str, float]
+    evidence_at: Callable[[Posterior | None], Evidence],
+    start: Sizes,
+    names: Sequence[str],
+    largest: Mapping[str, float],
+    beat: float = -np.inf,
 ) -> Learnt:
     """Learn the sizes called `names`, none larger than `largest` says.
 
-    evidence_at gives the evidence linearised at a posterior, or at rest for None.
+    evidence_at gives the evidence linearised at a posterior, or at rest for None. The search is given up when it will not reach a log
+    evidence of `beat`.
 
     With unit-variance coefficients z of a block of size s, d log evidence / d log s = sum of (E[z^2] - 1) and its second derivative is
     about -2 (number of coefficients that the photographs determine): Newton steps in log s (MacKay 1992). The columns are linearised
@@ -226,7 +233,8 @@ def learn_sizes(
         evidence = evidence_at(found)
         before, found = found, posterior(evidence, sizes)
         settled = abs(found.log_evidence - before.log_evidence) < SETTLED_NATS and _moved(before, found) < SETTLED_SIGMAS
-        if settled or not np.isfinite(found.log_evidence):
+        gain = found.log_evidence - before.log_evidence
+        if settled or not np.isfinite(gain) or found.log_evidence + STEPS_AHEAD * abs(gain) < beat:
             break
     return Learnt(found, found.log_evidence - penalty(found.sizes, names), settled)
 
@@ -292,7 +300,9 @@ def _second_moments(evidence: Evidence, at: Posterior, names: Sequence[str]) -> 
         if name in names:
             second = (away[rows] ** 2 + variance[rows]).sum() / size**2
             out[name] = float(second - rows.sum()), float(rows.sum() - variance[rows].sum() / size**2)
-    spread = ((at.local_by @ at.factor) ** 2).sum(axis=2) + np.diagonal(at.local_covariance, axis1=1, axis2=2)
+    # one large product: many small ones would take three times as long
+    by = at.local_by.reshape(-1, at.local_by.shape[-1]) @ at.factor
+    spread = np.einsum("rk,rk->r", by, by).reshape(-1, LOCAL) + np.diagonal(at.local_covariance, axis1=1, axis2=2)
     prior = _local_sigmas(evidence, sizes) ** 2
     ratio = (at.local_mean**2 + spread) / np.maximum(prior, 1e-300) - 1
     known = 1 - spread / np.maximum(prior, 1e-300)

@@ -21,6 +21,8 @@ InkOf = Callable[[Piece, int], Ink]
 
 # Free paper between pieces that share a page.
 GAP_MM = 4.0
+# So many pieces are listed by name on their page.
+LISTED = 4
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,9 @@ def lay_out(
         drawn[place.page].append(Group(tuple(shapes), tuple(float(v) for v in box)))  # type: ignore[arg-type]
     pages = []
     for number, content in enumerate(drawn, start=1):
-        names = ", ".join(_name(pieces, place) for place in places if place.page == number - 1)
+        own = [_name(pieces, place) for place in places if place.page == number - 1]
+        # pieces lie in their order, so the first and the last say enough
+        names = ", ".join(own) if len(own) <= LISTED else f"{own[0]} to {own[-1]}"
         words = f"{title}: sheet {number} of {count}: {names}. Print at 100 %, do not fit to the page."
         head = Group(strips(used, words))
         pages.append(Page(f"{title}, sheet {number} of {count}: {names}", used.width_mm, used.height_mm, (head, *content)))

@@ -24,6 +24,8 @@ BARS_MM = (100.0, 50.0)
 TICK_MM, BAR_AT_MM, WORDS_MM = 3.0, 2.0, 2.5
 # Width of a letter over its height in Helvetica, on average.
 LETTER_WIDTH = 0.75
+# Beside a bar with less room than this stands its length alone.
+LONG_WORDS_MM = 50.0
 
 
 @dataclass(frozen=True)
@@ -91,9 +93,10 @@ def strips(paper: Paper, words: str) -> tuple[Shape, ...]:
     for swap in (False, True):
         lines = [[[start, at], [start + bar, at]], *([[x, at - TICK_MM / 2], [x, at + TICK_MM / 2]] for x in (start, start + bar))]
         shapes += [Line(np.array(line)[:, ::-1] if swap else np.array(line)) for line in lines]
-    said = f"{bar:g} mm between the middles of the ticks"
-    shapes.append(Words(np.array([start + bar + 3, at - 1]), said, min(WORDS_MM, _fitting(said, paper.room_mm[0] - bar - 3))))
-    shapes.append(Words(np.array([at + 1, start + bar + 3]), said, min(WORDS_MM, _fitting(said, paper.room_mm[1] - bar - 3)), upwards=True))
+    room = paper.room_mm - bar - 3
+    for upwards, at_mm in ((False, [start + bar + 3, at - 1]), (True, [at + 1, start + bar + 3])):
+        said = f"{bar:g} mm" + " between the middles of the ticks" * bool(room[int(upwards)] > LONG_WORDS_MM)
+        shapes.append(Words(np.array(at_mm), said, min(WORDS_MM, _fitting(said, room[int(upwards)])), upwards))
     shapes.append(Words(np.array([start, at + 3]), words, min(WORDS_MM, _fitting(words, paper.room_mm[0]))))
     return tuple(shapes)
 

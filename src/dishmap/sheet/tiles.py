@@ -70,10 +70,11 @@ def tiles_of(piece: Piece, room_mm: Array, overlap_mm: float = OVERLAP_MM) -> tu
 def _check_count(piece: Piece, room: Array, overlap: float) -> None:
     if (room <= 2 * overlap).any():
         raise InputError(f"an overlap of {overlap:g} mm leaves nothing of the {words_of(room)} mm that the paper has room for")
-    count = float(np.prod(np.maximum(1, np.floor((piece.high_mm - piece.low_mm) / room))))
+    size = piece.high_mm - piece.low_mm
+    count = float(np.prod(np.where(size <= room, 1, np.maximum(2, np.floor(size / (room - 2 * overlap))))))
     if count > LARGEST_PAGES:
         raise InputError(
-            f"{piece.name} of {words_of(piece.high_mm - piece.low_mm)} mm needs {count:.0f} sheets or more; "
+            f"{piece.name} of {words_of(size)} mm needs {count:.0f} sheets or more; "
             f"up to {LARGEST_PAGES} are made: take larger paper, or check that sizes are in mm"
         )
 
