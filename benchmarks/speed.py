@@ -31,7 +31,7 @@ from dishmap.simulate.scene import Scene, Sensor, facing_pose
 from dishmap.targets.builders import dish
 from dishmap.targets.detect import find_ellipses
 from dishmap.targets.identify import Upright, identify
-from dishmap.targets.pose import measure_targets
+from dishmap.targets.pose import measure_targets, track_targets
 
 REPEATS = 3 if QUICK else 9
 GOAL_S, GOAL_MB, GOAL_IMPORT_S = 0.35, 250, 0.25
@@ -108,6 +108,7 @@ def main() -> None:
         ("find_ellipses", *seconds(lambda: find_ellipses(image)), "", ""),
         ("identify", *seconds(lambda: identify(found, pattern, camera, Upright())), "", ""),
         ("measure_targets", *seconds(lambda: measure_targets(image, camera, pattern, found, named)), "", ""),
+        ("track_targets (reference known)", *seconds(lambda: track_targets(image, camera, pattern, result.poses)), "", ""),
         ("map_photograph, all of it", *seconds(lambda: map_photograph(image, camera, pattern, Upright())), f"{GOAL_S} s", peaks["map"]),
         ("OpenCV SimpleBlobDetector", *seconds(lambda: blobs(image), 3), "", peaks["blobs"]),
         ("OpenCV solvePnP", *seconds(lambda: solve(centers, camera, pattern, truth), 3), "", ""),

@@ -23,7 +23,7 @@ ORDER = [
     # know nothing of cameras or dishes
     *("errors", "quality", "transforms", "robust"),
     # the camera
-    *("camera.model", "camera.undistort", "camera.board", "camera.chessboard", "camera.bundle", "camera.problem"),
+    *("camera.model", "camera.undistort", "camera.board", "camera.chessboard", "camera.charuco", "camera.bundle", "camera.problem"),
     *("camera.screening", "camera.calibrate", "camera.uncertainty", "camera.lens_choice", "camera.compare_cameras"),
     *("camera.resample", "camera.advice"),
     # shapes in which deformations are spoken of
@@ -41,6 +41,8 @@ ORDER = [
     *("targets.solve", "targets.edges", "targets.light", "targets.pixels", "targets.window", "targets.neighbours"),
     *("targets.adjust", "targets.start", "targets.sensitivity", "targets.scene_noise", "targets.glare", "targets.stages"),
     *("targets.settle", "targets.pose"),
+    # boards of circles
+    *("camera.board_labels", "camera.circle_board"),
     # measuring it as the paper does, and the limit of both
     *("targets.groups", "targets.paper", "targets.bound"),
     # the surface through the points
@@ -67,6 +69,7 @@ ORDER = [
     *("io.difference_file", "io.difference_results", "io.sheet_file"),
     # people: what a map says in words, in pictures, on a page
     *("verdict", "plot.canvas", "plot.photograph", "plot.maps", "plot.outlines", "plot.scene", "plot.calibration", "page", "report"),
+    "calibration_report",
     # and what a difference says
     *("difference_verdict", "difference_assumptions", "plot.difference", "plot.difference_photograph", "plot.difference_scene"),
     *("difference_report",),
@@ -88,6 +91,7 @@ WALLS = {
     "cv2": [
         "camera.undistort",
         "camera.chessboard",
+        "camera.charuco",
         "targets.detect",
         "io.images",
         "io.camera_file",

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dishmap.calibration_report import Checks, calibration_report
 from dishmap.camera.board import BENDS, BoardShape, BoardView
 from dishmap.camera.calibrate import Calibration
 from dishmap.camera.model import Camera
@@ -18,7 +19,7 @@ from dishmap.errors import ImageError
 from dishmap.page import script_json
 from dishmap.pipeline import Map, map_photograph
 from dishmap.quality import Quality
-from dishmap.report import calibration_report, map_report
+from dishmap.report import map_report
 from dishmap.simulate.render import simulate
 from dishmap.simulate.scene import Disc, Scene, Sensor, facing_pose
 from dishmap.surface.cloud import select_points
@@ -353,11 +354,11 @@ def test_the_report_of_a_calibration() -> None:
         expected=CAMERA.parameters,
         independent=1.0,
     )
-    html = calibration_report(calibration, HOSTILE)
+    html = calibration_report(calibration, HOSTILE, Checks())
     said = words(html)
     assert f"4 views fit to {number(calibration.rms_px)} px rms; corners cover 43% of the picture." in said
     assert "<bad> was left out: it is <blurred>." in said
     assert "Few views." in said
     assert ["fx", "800", "0.300", "px"] in parsed(html).rows
     assert "this radius is an expected error of" in said
-    assert calibration_report(calibration, HOSTILE) == html
+    assert calibration_report(calibration, HOSTILE, Checks()) == html

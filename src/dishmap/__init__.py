@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from dishmap.targets.detect import find_ellipses
     from dishmap.targets.identify import PoseGuess, Upright, identify
     from dishmap.targets.pattern import Pattern, Surface, TargetKind
-    from dishmap.targets.pose import measure_targets
+    from dishmap.targets.pose import measure_targets, track_targets
     from dishmap.targets.stages import Assumptions
     from dishmap.transforms import Pose
 
@@ -78,6 +78,7 @@ _HOME = {
     "identify": "dishmap.targets.identify",
     "map_photograph": "dishmap.pipeline",
     "measure_targets": "dishmap.targets.pose",
+    "track_targets": "dishmap.targets.pose",
     "paper_of": "dishmap.sheet.paper",
     "pattern_sheets": "dishmap.sheet.sheets",
     "plate": "dishmap.targets.builders",
@@ -137,6 +138,7 @@ __all__ = [
     "read_measurement",
     "read_pattern",
     "simulate_photograph",
+    "track_targets",
     "undistort_image",
     "undistort_points",
     "write_camera",

@@ -1,4 +1,4 @@
-"""The report of a map, and of a calibration: one HTML page that works offline, can be printed, and says first what matters.
+"""The report of a map: one HTML page that works offline, can be printed, and says first what matters.
 
 The same input gives the same page, byte for byte, with the same versions of the libraries that are listed at its end.
 """
@@ -12,12 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap import __version__
-from dishmap.camera.calibrate import Calibration
 from dishmap.camera.model import Camera
 from dishmap.camera.uncertainty import projection_error
 from dishmap.page import bullet_list, charts, fact_grid, figure, page, paragraph, script_json, section, table, verdict_box
 from dishmap.pipeline import Map
-from dishmap.plot.calibration import coverage_map, view_bars
 from dishmap.plot.maps import normals_map, ratio_histogram, residual_map, sigma_map
 from dishmap.plot.outlines import check_picture, outlines_of, unused_outlines
 from dishmap.plot.photograph import error_svg, photograph_frame, photograph_svg
@@ -48,58 +46,12 @@ def map_report(result: Map, image: NDArray[np.generic], title: str, inputs: dict
         _photograph(result, numbers, image),
         _surface(result, numbers),
         _targets(result, numbers),
-        _calibration_error(result.camera, image),
+        calibration_error_section(result.camera, image),
         _quality(result),
         _table(result, numbers),
-        _inputs(inputs),
+        inputs_section(inputs),
     ]
     return page(title, body, _scripts(result, numbers))
-
-
-def calibration_report(calibration: Calibration, title: str) -> str:
-    """The report of a camera's calibration as one HTML page: residuals of each view, coverage, parameters, expected projection error."""
-    camera, views = calibration.camera, calibration.views
-    pixels = np.concatenate([view.pixels for view in views])
-    residuals, used = np.concatenate(calibration.residuals_px), np.concatenate(calibration.used)
-    headline = f"{len(views)} views fit to {number(calibration.rms_px)} px rms; corners cover {calibration.coverage:.0%} of the picture."
-    notes = [f"{note[:1].upper()}{note[1:]}." for note in calibration.notes]
-    notes += [f"{name} was left out: {reason}." for name, reason in calibration.rejected.items()]
-    facts = [
-        ("Views used", f"{len(views)} of {len(views) + len(calibration.rejected)}", f"{int(used.sum())} of {len(used)} corners"),
-        ("Rms residual", f"{number(calibration.rms_px)} px", "of both coordinates together"),
-        ("Noise of a coordinate", f"{number(calibration.sigma_px)} px", f"sigmas enlarged {number(calibration.inflation)} times"),
-        ("Coverage", f"{calibration.coverage:.0%}", "of the picture held corners"),
-    ]
-    bars = figure(
-        view_bars(calibration.view_names, calibration.view_rms_px, calibration.rms_px),
-        "Root mean square residual of each view. One that stands out was moved, blurred or wrongly found.",
-        "Bars of the residual of each view.",
-    )
-    where = figure(
-        coverage_map(pixels, residuals, used, camera.width_px, camera.height_px),
-        "All corners, coloured by the length of their residual. Where there are none, the lens is extrapolated.",
-        "Map of where corners were seen.",
-    )
-    body = [
-        verdict_box(headline, bool(notes)),
-        fact_grid(facts),
-        section("What to know", bullet_list(notes)) if notes else "",
-        section("Views", charts(bars, where)),
-        section("Parameters", _parameters(camera)),
-        _calibration_error(camera, None),
-        _inputs({}),
-    ]
-    return page(title, body)
-
-
-def _parameters(camera: Camera) -> str:
-    sigmas = np.full(len(camera.parameters), np.nan) if camera.covariance is None else np.sqrt(np.diag(camera.covariance))
-    rows = [
-        (name, f"{value:.6g}", number(float(sigma)), "px" if i < 4 else "1")
-        for i, (name, value, sigma) in enumerate(zip(camera.parameter_names, camera.parameters, sigmas, strict=True))
-    ]
-    size = f"{camera.width_px}x{camera.height_px} px, lens model {camera.model}"
-    return paragraph(size) + table(("parameter", "value", "sigma", "unit"), rows, (0, 3))
 
 
 def _verdict(verdict: Verdict) -> list[str]:
@@ -197,7 +149,8 @@ def _coefficients(fit: SurfaceFit) -> str:
     return f"<h3>Coefficients of the {fit.basis.kind} (dish frame)</h3>" + table(heads, rows, (0, len(heads) - 1))
 
 
-def _calibration_error(camera: Camera, image: NDArray[np.generic] | None) -> str:
+def calibration_error_section(camera: Camera, image: NDArray[np.generic] | None) -> str:
+    """The paper's Fig. 1: circles of the expected projection error, over a photograph (H, W) if one is given."""
     heading = "Expected projection error of the camera"
     if camera.covariance is None:
         return section(heading, paragraph("Not known: the camera file carries no covariance. `dishmap calibrate` writes one that does."))
@@ -242,7 +195,8 @@ def _table(result: Map, numbers: Numbers) -> str:
     return section("All measured targets", about, table(heads, zip(*columns, strict=True), (len(heads) - 1,)))
 
 
-def _inputs(inputs: dict[str, str]) -> str:
+def inputs_section(inputs: dict[str, str]) -> str:
+    """What the page was made from, and by which versions."""
     versions = [("dishmap", __version__), ("Python", platform.python_version()), *((name, _version(name)) for name in LIBRARIES)]
     rows = [*inputs.items(), *((f"version of {name}", text) for name, text in versions)]
     return section("Inputs and versions", table(("what", "value"), rows, (0, 1)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +13,14 @@ from click.testing import Result
 from printing import SvgPage, dishmap, placed_shifts
 
 from dishmap.cli import sheet as words_of_the_program
-from dishmap.errors import InputError
+from dishmap.errors import InputError, PatternError
 from dishmap.io.pattern_file import read_pattern, write_pattern
 from dishmap.sheet.boards import BOARDS
 from dishmap.sheet.markers import DICTIONARIES
 from dishmap.sheet.paper import Paper, paper_of
 from dishmap.sheet.pdf import pdf_bytes
 from dishmap.sheet.sheets import CORNER_MARKS, pattern_sheets
+from dishmap.sheet.tiles import tiles_of
 from dishmap.targets.builders import disc, dish, plate
 from dishmap.targets.pattern import Pattern
 
@@ -153,6 +155,15 @@ def test_broken_pattern_files_are_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+def test_targets_off_the_surface_are_refused() -> None:
+    flat = plate(3, 3, 45.0)
+    lifted, leaning = flat.center_mm.copy(), flat.normal.copy()
+    lifted[4, 2], leaning[4] = 0.5, [0.0, np.sin(0.02), np.cos(0.02)]
+    for pattern in (replace(flat, center_mm=lifted), replace(flat, normal=leaning)):
+        with pytest.raises(PatternError, match=r"target 4 stands .* print the pattern that was designed"):
+            pattern_sheets(pattern, paper_of("A4"))
+
+
 def test_names_with_odd_letters_go_into_the_files(tmp_path: Path) -> None:
     done = dishmap("sheet", *PLATE, "--name", "plate (Ø 3\\ <&> 漢", "--out", tmp_path)
     assert done.exit_code == 0, (done.output, done.exception)
@@ -183,3 +194,23 @@ def test_functions_refuse_what_the_options_would() -> None:
     ):
         with pytest.raises(InputError, match=message):
             call()
+
+
+@pytest.mark.parametrize("pitch_mm", [21.0, 26.5, 33.0, 47.0, 61.3, 95.0])
+@pytest.mark.parametrize("stagger", [False, True])
+def test_cuts_pass_between_targets_where_they_can(pitch_mm: float, stagger: bool) -> None:
+    """Discs of 20 mm with 1 mm and more between their columns; every second row is moved, which leaves only its own gaps free."""
+    piece = pattern_sheets(plate(15, 12, pitch_mm, disc(10.0)), paper_of("A3")).pieces[0]
+    if stagger:
+        moved = np.where(np.arange(len(piece.keep_mm)) // 12 % 2 == 0, 0.0, pitch_mm)
+        keep = piece.keep_mm + np.column_stack([moved, 0 * moved, 0 * moved])
+        piece = replace(piece, keep_mm=keep, high_mm=piece.high_mm + [pitch_mm, 0])
+    tiles, crosses = tiles_of(piece, paper_of("A4").room_mm)
+    assert sorted(np.concatenate([tile.own for tile in tiles]).tolist()) == list(range(len(piece.keep_mm)))
+    for tile in tiles:
+        keep = piece.keep_mm[tile.own]
+        assert len(tile.crossing) == 0
+        assert (keep[:, :2] - keep[:, 2:] > tile.cut_low).all()
+        assert (keep[:, :2] + keep[:, 2:] < tile.cut_high).all()
+        assert (tile.high - tile.low <= paper_of("A4").room_mm + 1e-9).all()
+    assert len(crosses)

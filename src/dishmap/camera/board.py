@@ -61,6 +61,15 @@ class BoardSearch:
     rejected: dict[str, str]
 
 
+def check_same_size(first: tuple[str, tuple[int, int]], name: str, shape: tuple[int, int]) -> None:
+    """Raise InputError for photographs of different sizes."""
+    if shape != first[1]:
+        raise InputError(
+            f"photographs of one camera have one size, but {first[0]} has {first[1][1]}x{first[1][0]} px and {name} "
+            f"{shape[1]}x{shape[0]}: calibrate each size apart, all turned the same way"
+        )
+
+
 def board_frame(views: Sequence[BoardView]) -> tuple[Array, float]:
     """Middle of the board (2,) and half of its longer side, mm, over all that was seen of it."""
     xy = np.concatenate([view.board_mm[:, :2] for view in views])

@@ -1,9 +1,9 @@
 """Which circle of a flat board is which ellipse, with nothing known of the camera.
 
 A mark and two of its neighbours give an affine map from board to picture near them; from there the labels grow from neighbour to
-neighbour, each predicted by an affine map through the nearest labels, so that perspective and any lens are followed. A lattice of equal circles
-looks the same after a shift: every other way to lay the board over what was labelled is then counted out, and unless one of them is
-clearly the best, none is chosen.
+neighbour, each predicted by an affine map through the nearest labels, so that perspective and any lens are followed. A lattice of
+equal circles looks the same after a shift: every other way to lay the board over what was labelled is then counted out, and unless
+one of them is clearly the best, none is chosen.
 """
 
 from __future__ import annotations
@@ -207,7 +207,7 @@ class _Board:
         return bool(np.nanmedian(off) < FIT_TOLERANCE)
 
     def _predicted(self, match: Index, known: Index, marks: Index, skip: int = 0) -> tuple[Array, Array]:
-        """Where marks (N,) should be seen, (N, 2), and the scale there, by affine maps through the nearest labels; skip=1: not their own."""
+        """Where marks (N,) should be seen, (N, 2), and the scale there, by affine maps through the nearest labels (skip=1: others)."""
         count = min(LOCAL_LABELS, len(known) - skip)
         _, near = cKDTree(self.xy[known]).query(self.xy[marks], k=count + skip)
         near = known[near.reshape(len(marks), count + skip)[:, skip:]]

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dishmap.camera.board import BoardSearch, BoardView
+from dishmap.camera.board import BoardSearch, BoardView, check_same_size
 from dishmap.errors import ImageError, InputError, MeasurementError
 
 Array = NDArray[np.float64]
@@ -213,21 +213,31 @@ def find_boards(
     sizes, MeasurementError when no photograph shows the board.
     """
     board = chessboard_mm(corners, square_mm)
+    return search_photographs(photographs, board, lambda gray: find_chessboard(gray, corners), total, progress)
+
+
+def search_photographs(
+    photographs: Iterable[tuple[str, Gray]],
+    board_mm: Array,
+    find: Callable[[Gray], Array],
+    total: int = 0,
+    progress: Progress | None = None,
+) -> BoardSearch:
+    """Find a board's corners (N, 3) in each photograph with `find`, which gives pixels (N, 2), NaN where a corner is not seen.
+
+    Raises as `find_boards` does.
+    """
     views: list[BoardView] = []
     rejected: dict[str, str] = {}
     first: tuple[str, tuple[int, int]] | None = None
-    for done, (name, shape, found) in enumerate(_in_parallel(photographs, corners), start=1):
+    for done, (name, shape, found) in enumerate(_in_parallel(photographs, find), start=1):
         first = first or (name, shape)
-        if shape != first[1]:
-            raise InputError(
-                f"photographs of one camera have one size, but {first[0]} has {first[1][1]}x{first[1][0]} px and {name} "
-                f"{shape[1]}x{shape[0]}: calibrate each size apart, all turned the same way"
-            )
+        check_same_size(first, name, shape)
         if isinstance(found, MeasurementError):
             rejected[name] = str(found)
         else:
             seen = np.isfinite(found[:, 0])
-            views.append(BoardView(name, found[seen], board[seen]))
+            views.append(BoardView(name, found[seen], board_mm[seen]))
         if progress:
             progress(done, max(total, done))
     if first is None:
@@ -238,13 +248,13 @@ def find_boards(
 
 
 def _in_parallel(
-    photographs: Iterable[tuple[str, Gray]], corners: tuple[int, int]
+    photographs: Iterable[tuple[str, Gray]], find: Callable[[Gray], Array]
 ) -> Iterator[tuple[str, tuple[int, int], Array | MeasurementError]]:
     """Results in order, two photographs at a time: the corner fit is single-threaded."""
 
     def work(gray: Gray) -> Array | MeasurementError:
         try:
-            return find_chessboard(gray, corners)
+            return find(gray)
         except MeasurementError as error:
             return error
 

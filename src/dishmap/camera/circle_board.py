@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dishmap.camera.board import BoardSearch, BoardView
+from dishmap.camera.board import BoardSearch, BoardView, check_same_size
 from dishmap.camera.board_labels import Labels, label_board
 from dishmap.camera.calibrate import FEWEST_CORNERS, Calibration
 from dishmap.errors import IdentityError, InputError, MeasurementError
@@ -53,10 +53,11 @@ def find_circle_boards(
     rejected: dict[str, str] = {}
     detections: dict[str, Detections] = {}
     labels: dict[str, Labels] = {}
-    first: tuple[str, tuple[int, ...]] | None = None
+    first: tuple[str, tuple[int, int]] | None = None
     for done, (name, gray) in enumerate(photographs, start=1):
-        first = first or (name, gray.shape)
-        check_same_size(first, name, gray.shape)
+        shape = (gray.shape[0], gray.shape[1])
+        first = first or (name, shape)
+        check_same_size(first, name, shape)
         found = find_ellipses(gray)
         try:
             labels[name] = label_board(found, pattern, gray.shape[1], gray.shape[0])
@@ -71,15 +72,6 @@ def find_circle_boards(
     if not views:
         raise MeasurementError(f"no photograph shows the board: {first[0]}: {rejected[first[0]]}")
     return CircleSearch(BoardSearch(tuple(views), first[1][1], first[1][0], rejected), detections, labels)
-
-
-def check_same_size(first: tuple[str, tuple[int, ...]], name: str, shape: tuple[int, ...]) -> None:
-    """Raise InputError for photographs of different sizes."""
-    if shape != first[1]:
-        raise InputError(
-            f"photographs of one camera have one size, but {first[0]} has {first[1][1]}x{first[1][0]} px and {name} "
-            f"{shape[1]}x{shape[0]}: calibrate each size apart, all turned the same way"
-        )
 
 
 def outline_view(name: str, pattern: Pattern, detections: Detections, labels: Labels) -> BoardView:
@@ -116,9 +108,7 @@ def measured_views(
     return tuple(views), rejected
 
 
-def _measured(
-    name: str, gray: Gray, pattern: Pattern, detections: Detections, identity: Identity, calibration: Calibration
-) -> BoardView:
+def _measured(name: str, gray: Gray, pattern: Pattern, detections: Detections, identity: Identity, calibration: Calibration) -> BoardView:
     poses = measure_targets(gray, calibration.camera, pattern, detections, identity)
     good = (poses.quality & int(SPOILT)) == 0
     if good.sum() < FEWEST_CORNERS:

@@ -37,6 +37,8 @@ PASSES = 3
 SCREEN = Sizes(normal_mm=1.0, slide_strain=1e-3, rough_mm=1.0, print_strain=1e-3)
 SCREEN_ROUNDS, SCREEN_STEP, SCREEN_RATIO, FIT_RATIO = 20, 4.0, 30.0, 5.0
 LIKE_MOST, USUAL_MISFIT = 0.75, 7.8
+# The search for the size of the displacement starts at what the screening saw, within these.
+START_MM = (0.005, 2.0)
 # When more targets than this share would have to go, it is the surface that is strange, not they.
 LEAST_KEPT = 0.7
 OUTLIER_ROUNDS = 5
@@ -170,6 +172,10 @@ class _Problem:
                 break
             self.kept = kept
             found = posterior(self.evidence(columns, found), wide)
+        if "normal_mm" in self.learnt:
+            own = columns.block == BLOCKS.index("normal")
+            rise = np.einsum("ni,nik,k->n", self.pattern.normal[self.changes.index], columns.move[..., own], found.mean[own], optimize=True)
+            self.start = replace(self.start, normal_mm=float(np.clip(rise.std(), *START_MM)))
 
     def put_aside(self, best: Hypothesis) -> bool:
         """Judge every target by the best hypothesis; True when that changed the judgement of any.

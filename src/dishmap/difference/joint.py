@@ -194,7 +194,7 @@ RANGES = {
 # Width of that prior and the largest step (e-folds).
 PRIOR_FOLDS, LARGEST_FOLDS = 4.0, 2.0
 # Settled: another step changes the log evidence by less than this, and no coefficient by more than this share of its sigma.
-SETTLED_NATS, SETTLED_SIGMAS = 0.2, 0.1
+SETTLED_NATS, SETTLED_SIGMAS = 0.5, 0.15
 LEARN_STEPS = 40
 # Steps converge at least geometrically: what is left to gain is less than this many times the last gain.
 STEPS_AHEAD = 20.0

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dishmap.errors import InputError
+from dishmap.errors import InputError, PatternError
 from dishmap.sheet.boards import CornerBoard, board_piece
 from dishmap.sheet.flatten import Flat
 from dishmap.sheet.gores import LARGEST_STRAIN, cut_targets, dish_pieces
@@ -24,6 +24,8 @@ from dishmap.targets.pattern import Pattern
 Array = NDArray[np.float64]
 
 CORNER_MARKS = ("aruco", "apriltag")
+# A target this far off the surface, or leaning so much, would not be what the pattern file says once it is printed.
+LARGEST_OFF_MM, LARGEST_LEAN_DEG = 0.01, 0.1
 # A corner mark is as large as a target, within these limits, with this much free paper around it.
 MARK_RANGE_MM, MARK_GAP_PART = (12.0, 60.0), 0.25
 
@@ -79,9 +81,10 @@ def pattern_sheets(
     """Sheets of a pattern at true scale: one piece for a plate, cap and gores for a dish.
 
     corner_marks: `aruco` (4x4_50) or `apriltag` (36h11), numbers 0 to 3 from the upper left clockwise, for plates. Raises
-    InputError when a target does not fit on the paper, PatternError when the strain's limit cannot be kept.
+    InputError when a target does not fit on the paper, PatternError when the strain's limit cannot be kept or targets are off the surface.
     """
     _check_overlap(overlap_mm)
+    _check_on_surface(pattern)
     marks: tuple[CornerMark, ...] = ()
     if pattern.surface.kind == "paraboloid":
         if corner_marks is not None:
@@ -121,6 +124,19 @@ def as_printed(sheets: Sheets, measured_mm: Sequence[float]) -> Pattern | Corner
 def _check_overlap(overlap_mm: float) -> None:
     if not (np.isfinite(overlap_mm) and overlap_mm >= 0):
         raise InputError(f"an overlap of {overlap_mm:g} mm cannot be; it must be 0 or more")
+
+
+def _check_on_surface(pattern: Pattern) -> None:
+    """Raise PatternError for targets that stand off the nominal surface or lean: paper that is laid on it cannot hold them."""
+    xy = pattern.center_mm[:, :2]
+    off = np.abs(pattern.center_mm[:, 2] - pattern.surface.height_mm(xy))
+    lean = np.degrees(np.arccos(np.clip((pattern.normal * pattern.surface.normal(xy)).sum(axis=1), -1, 1)))
+    worst = int(np.argmax(off / LARGEST_OFF_MM + lean / LARGEST_LEAN_DEG))
+    if off[worst] > LARGEST_OFF_MM or lean[worst] > LARGEST_LEAN_DEG:
+        raise PatternError(
+            f"target {pattern.ids[worst]} stands {off[worst]:.3g} mm off the pattern's surface and leans by {lean[worst]:.2g} degrees; "
+            "sheets lie on the surface, so print the pattern that was designed, not one that was measured"
+        )
 
 
 def _used(paper: Paper, pages: Sequence[Page]) -> Paper:

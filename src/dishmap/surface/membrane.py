@@ -165,7 +165,7 @@ class Membrane:
 
 def membrane(fields: Fields) -> Membrane:
     """Strain energy and mean rigid slides of the fields, by exact quadrature over the disc."""
-    xy, weight = disc_points(fields.radius_mm, 2 * fields.degree + 8)
+    xy, weight = disc_points(fields.radius_mm, 2 * fields.degree + 6)
     axes = tangent_axes(fields.surface, xy)
     motion = fields.at(xy, axes)
     strain = motion.strain(axes)
