@@ -38,6 +38,8 @@ FEWEST_LABELS = 12
 MOST_ROUNDS = 200
 # Another way to lay the board must explain this many labels less: one that is hidden or stained must not decide.
 DECISIVE = 3
+# Two circles may be stained; more that are of another kind than the mark of their place tell of a wrong or mirrored board.
+MOST_CLASHES = 2
 # Ways that carry this part of the labels onto marks are grown, so many at most, and again as long as more is labelled.
 MOVE_PART, MOST_MOVES, MOST_LAYINGS = 0.6, 48, 6
 # Half angle of a nominal camera, for what depends on one hardly: which ellipses have what inside.
@@ -73,6 +75,12 @@ def label_board(detections: Detections, pattern: Pattern, width_px: int, height_
             "check that this is the printed board, and that it is not mirrored"
         )
     match = board.settled(match)
+    strange = board.clashes(match)
+    if strange > MOST_CLASHES:
+        raise IdentityError(
+            f"circles are arranged like the board {pattern.name!r}, but {strange} of them look unlike the marks of their places; check that "
+            "this is the printed board, and that the photograph is not mirrored"
+        )
     mark = np.flatnonzero(match >= 0)
     return Labels(mark, board.candidates.detection[match[mark]])
 
@@ -243,6 +251,16 @@ class _Board:
             if settled:
                 break
         return match
+
+    def clashes(self, match: Index) -> int:
+        """Places without a label that show a circle which cannot be the mark of that place."""
+        known, open_ = np.flatnonzero(match >= 0), np.flatnonzero(match < 0)
+        if not len(open_):
+            return 0
+        predicted, scale = self._predicted(match, known, open_)
+        off, hit = self.tree.query(np.where(np.isfinite(predicted), predicted, -1e9))
+        there = (off < GROW_TOLERANCE * self.spacing[open_] * scale) & ~np.isin(hit, match[known])
+        return int((there & ~self.candidates.may_be_type[hit, self.type[open_]]).sum())
 
     def _laid(self, match: Index, marks: Index, turn: Array, shift: Array) -> Index:
         """The labels after a move, without those that do not look like their new marks."""

@@ -53,7 +53,7 @@ def plate_command(rows: int, columns: int, pitch_mm: float, orientation_marks: b
     """A flat plate of targets on a square lattice."""
     from dishmap.targets.builders import plate
 
-    target, kind_name = _kind(**kind)
+    target, kind_name = kind_of(**kind)
     _write(plate(rows, columns, pitch_mm, target, kind_name, orientation_marks, name), out)
 
 
@@ -78,12 +78,12 @@ def dish_command(
     """A paraboloid with targets on concentric circles."""
     from dishmap.targets.builders import dish
 
-    target, kind_name = _kind(**kind)
+    target, kind_name = kind_of(**kind)
     pattern = dish(diameter_mm, focal_length_mm, spacing_mm, target, kind_name, orientation_marks, margin_mm, not no_center_target, name)
     _write(pattern, out)
 
 
-def _kind(kind: str, **sizes: Any) -> tuple[TargetKind, str]:
+def kind_of(kind: str, **sizes: Any) -> tuple[TargetKind, str]:
     """The kind of target that the options describe, and its name. A size that this kind does not have is a usage error."""
     from dishmap.targets.builders import KIND_BUILDERS
 

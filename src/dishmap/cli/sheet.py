@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dishmap.cli.options import PATH, POSITIVE, F, Grid, Number, Numbers, out_folder, refuse_overwriting
-from dishmap.cli.pattern import _kind, dish_command, plate_command
+from dishmap.cli.pattern import kind_of, dish_command, plate_command
 from dishmap.cli.terminal import say
 from dishmap.errors import InputError
 
@@ -106,7 +106,7 @@ def plate_sheet(rows: int, columns: int, pitch_mm: float, orientation_marks: boo
     """Sheets of a flat plate of targets."""
     from dishmap.targets.builders import plate
 
-    target, kind_name = _kind(**_without_sheet_options(options))
+    target, kind_name = kind_of(**_without_sheet_options(options))
     _make(plate(rows, columns, pitch_mm, target, kind_name, orientation_marks, name), out, **_only_sheet_options(options))
 
 
@@ -127,7 +127,7 @@ def dish_sheet(
     """Gores of a dish, to glue on or to cut stencils from."""
     from dishmap.targets.builders import dish
 
-    target, kind_name = _kind(**_without_sheet_options(options))
+    target, kind_name = kind_of(**_without_sheet_options(options))
     pattern = dish(diameter_mm, focal_length_mm, spacing_mm, target, kind_name, orientation_marks, margin_mm, not no_center_target, name)
     _make(pattern, out, **_only_sheet_options(options))
 
