@@ -210,7 +210,7 @@ class _Problem:
         ways, lengths = self._ways(), self._lengths()
         middle = lengths[len(lengths) // 2]
         total = len(ways) + len(lengths)
-        every = []
+        every: list[Hypothesis] = []
         for way in ways:
             every.append(self.fit(way, middle, beat=max((h.log_weight for h in every), default=-np.inf)))
             tell(len(every), total)
