@@ -79,7 +79,7 @@ def remarks_on(calibration: Calibration, checks: Checks) -> list[str]:
     remarks += [f"{name} was left out: {reason}." for name, reason in calibration.rejected.items()]
     for name, corners in calibration.outliers.items():
         more = f" and {len(corners) - LISTED} more" if len(corners) > LISTED else ""
-        remarks.append(f"{name}: {len(corners)} corners left out: {'; '.join(corners[:LISTED])}{more}.")
+        remarks.append(f"{name}: {len(corners)} corner{'s' * (len(corners) > 1)} left out: {'; '.join(corners[:LISTED])}{more}.")
     weak = [f"{name} ({w:.0%})" for name, w in zip(calibration.view_names, calibration.view_weight, strict=True) if w < 0.5]
     if weak:
         remarks.append(f"Noisier than the other views, and weighed down: {', '.join(weak)}. Were camera or board moving?")
@@ -127,7 +127,7 @@ def _next(suggestions: tuple[Suggestion, ...]) -> str:
         f"{number(s.after_px)} px."
         for s in suggestions
     ]
-    lead = paragraph("What would improve this calibration most, one view on top of the other ; left and upper are those of the picture:")
+    lead = paragraph("What would improve this calibration most, one view on top of the other; left and upper are those of the picture:")
     return section("What to photograph next", lead, bullet_list(words))
 
 
@@ -198,7 +198,7 @@ def _lens(calibration: Calibration, choice: LensChoice | None) -> str:
         for trial in choice.trials
     ]
     heads = ("lens model, from lean to rich", "rms of its own views (px)", "typical rms of views held out (px)", "")
-    return section("Lens", paragraph(f"{choice.reason[:1].upper()}{choice.reason[1:]}."), table(heads, rows, (0, 3)), picture)
+    return section("Lens", paragraph(f"{choice.reason}."), table(heads, rows, (0, 3)), picture)
 
 
 def _board(calibration: Calibration) -> str:

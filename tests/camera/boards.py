@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dishmap.camera.board import BoardView
+from dishmap.camera.board import BENDS, BoardView, bends_of
 from dishmap.camera.chessboard import chessboard_mm
 from dishmap.camera.model import Camera
 from dishmap.simulate.render import simulate
@@ -52,11 +52,13 @@ def photographs(rng: np.random.Generator, camera: Camera, pattern: Pattern, coun
     ], poses
 
 
-def corner_views(rng: np.random.Generator, camera: Camera, count: int, noise_px: float = 0.1) -> list[BoardView]:
-    """Views of a flat chessboard with noise on its corners."""
+def corner_views(rng: np.random.Generator, camera: Camera, count: int, noise_px: float = 0.1, bend_mm: float = 0.0) -> list[BoardView]:
+    """Views of a chessboard with noise on its corners; bend_mm: sigma of each of its bends, which all views share."""
     middle = CORNERS.mean(axis=0)
-    poses = poses_in_view(rng, camera, CORNERS - middle, count)
+    printed = CORNERS - middle
+    printed[:, 2] += bends_of(printed, np.zeros(2), float(np.ptp(printed, axis=0).max()) / 2) @ rng.normal(size=len(BENDS)) * bend_mm
+    poses = poses_in_view(rng, camera, printed, count)
     return [
-        BoardView(f"{k}", camera.project(pose.apply(CORNERS - middle)) + rng.normal(size=(len(CORNERS), 2)) * noise_px, CORNERS)
+        BoardView(f"{k}", camera.project(pose.apply(printed)) + rng.normal(size=(len(CORNERS), 2)) * noise_px, CORNERS)
         for k, pose in enumerate(poses)
     ]

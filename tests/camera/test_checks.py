@@ -66,6 +66,19 @@ def test_few_views_take_the_leanest_lens() -> None:
         choose_lens([], 960, 720)
 
 
+def test_views_from_one_side_take_the_leanest_lens() -> None:
+    rng, views, middle = np.random.default_rng(8), [], CORNERS.mean(axis=0)
+    warp = rng.normal(size=(len(CORNERS), 3)) * [0.1, 0.1, 0.0]  # mm, the print
+    while len(views) < 16:
+        pose = Pose.from_rotation_vector(np.append(rng.uniform(-0.09, 0.09, 2), 0.0), np.append(rng.uniform(-30, 30, 2), 260))
+        pixels = CAMERA.project(pose.apply(CORNERS - middle + warp)) + rng.normal(size=(len(CORNERS), 2)) * 0.01
+        if CAMERA.contains(pixels).all():
+            views.append(BoardView(f"{len(views)}", pixels, CORNERS))
+    calibration, choice = choose_lens(views, 960, 720)
+    assert calibration.lens == "opencv5"
+    assert "a richer lens model would learn the errors of the print" in choice.reason
+
+
 def test_motion_between_cameras_is_no_difference() -> None:
     rays = CAMERA.unproject(picture_grid(960, 720, (4, 5)))
     assert np.isfinite(rays).all()

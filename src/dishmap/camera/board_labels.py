@@ -78,8 +78,8 @@ def label_board(detections: Detections, pattern: Pattern, width_px: int, height_
     strange = board.clashes(match)
     if strange > MOST_CLASHES:
         raise IdentityError(
-            f"circles are arranged like the board {pattern.name!r}, but {strange} of them look unlike the marks of their places; check that "
-            "this is the printed board, and that the photograph is not mirrored"
+            f"circles are arranged like the board {pattern.name!r}, but {strange} of them look unlike the marks of their places; check "
+            "that this is the printed board, and that the photograph is not mirrored"
         )
     mark = np.flatnonzero(match >= 0)
     return Labels(mark, board.candidates.detection[match[mark]])

@@ -242,14 +242,14 @@ def _result(
     )
 
 
-def _largest_turn_rad(bundle: Bundle) -> float:
+def largest_turn_rad(bundle: Bundle) -> float:
     """The largest angle between the board's normals in any two views."""
     normals = bundle.rotation[:, :, 2]
     return float(angle_between_rad(normals[:, None], normals[None]).max())
 
 
 def _check_turn(bundle: Bundle) -> None:
-    turn = _largest_turn_rad(bundle)
+    turn = largest_turn_rad(bundle)
     if turn < SMALLEST_TURN_RAD:
         raise MeasurementError(
             f"all views show the board in one direction (within {np.degrees(turn):.1f} degrees), so focal length and distance cannot "
@@ -324,7 +324,7 @@ def _notes(bundle: Bundle, coverage: float) -> tuple[str, ...]:
     notes = []
     if len(bundle.rotation) < WEAK_VIEWS:
         notes.append(f"only {len(bundle.rotation)} views were used; 10 to 20 make the uncertainty itself trustworthy")
-    if (turn := _largest_turn_rad(bundle)) < WEAK_TURN_RAD:
+    if (turn := largest_turn_rad(bundle)) < WEAK_TURN_RAD:
         notes.append(f"the board's directions differ by {np.degrees(turn):.0f} degrees at most; 40 or more fix the focal length better")
     if coverage < WEAK_COVERAGE:
         notes.append(f"corners cover {coverage:.0%} of the picture; the camera is extrapolated elsewhere")

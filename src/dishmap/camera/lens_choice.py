@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.camera.board import BoardView
-from dishmap.camera.calibrate import Calibration, calibrate
+from dishmap.camera.calibrate import WEAK_TURN_RAD, Calibration, calibrate, largest_turn_rad
 from dishmap.errors import CameraError, MeasurementError
 
 Array = NDArray[np.float64]
@@ -58,6 +58,9 @@ def choose_lens(
         only = calibrate(views, width_px, height_px, CANDIDATES[0], flat)
         why = f"{len(views)} views are too few to hold some out ({FEWEST_VIEWS} are needed), so the leanest lens model was taken"
         return only, LensChoice(only.lens, (Trial(only.lens, only.rms_px, np.nan),), why)
+    leanest = _if_alike(views, width_px, height_px, flat)
+    if leanest is not None:
+        return leanest
     made: dict[str, Calibration] = {}
     problems: dict[str, MeasurementError | CameraError] = {}
     errors: dict[str, Array] = {}
@@ -79,6 +82,25 @@ def choose_lens(
         for name in CANDIDATES
     )
     return made[lens], LensChoice(lens, trials, reason)
+
+
+def _if_alike(views: Sequence[BoardView], width_px: int, height_px: int, flat: bool) -> tuple[Calibration, LensChoice] | None:
+    """The leanest lens where all views show the board from nearly one side.
+
+    Errors of the print then lie at the same places of all pictures, and a richer lens would learn them, held-out views or not.
+    """
+    try:
+        only = calibrate(views, width_px, height_px, CANDIDATES[0], flat)
+    except (MeasurementError, CameraError):
+        return None
+    turn = largest_turn_rad(only.bundle)
+    if turn >= WEAK_TURN_RAD:
+        return None
+    why = (
+        f"the board's directions differ by {np.degrees(turn):.0f} degrees only, so that a richer lens model would learn the errors of the "
+        "print; the leanest was taken"
+    )
+    return only, LensChoice(only.lens, (Trial(only.lens, only.rms_px, np.nan),), why)
 
 
 def held_out_errors(calibration: Calibration, names: Sequence[str]) -> Array:
@@ -119,7 +141,8 @@ def _chosen(errors: dict[str, Array]) -> tuple[str, str]:
             continue
         mean, error = float(worse.mean()), float(worse.std(ddof=1) / np.sqrt(len(worse)))
         if lens == best:
-            return lens, f"{lens} has the smallest error on views held out ({level:.3g} px), and no leaner lens model comes near it"
+            near = "" if lens == next(iter(logs)) else ", and no leaner lens model comes near it"
+            return lens, f"{lens} has the smallest error on views held out ({level:.3g} px){near}"
         if mean <= max(error, SAME_PART):
             by = f"{100 * np.expm1(mean):.2g} %, standard error {100 * error:.2g} %"
             return lens, f"{lens} is the leanest lens model whose error on views held out equals that of the best ({best}; worse by {by})"

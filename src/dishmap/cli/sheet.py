@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dishmap.cli.options import PATH, POSITIVE, F, Grid, Number, Numbers, out_folder, refuse_overwriting
-from dishmap.cli.pattern import kind_of, dish_command, plate_command
+from dishmap.cli.pattern import dish_command, kind_of, plate_command
 from dishmap.cli.terminal import say
 from dishmap.errors import InputError
 

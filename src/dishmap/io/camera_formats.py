@@ -61,9 +61,7 @@ def read_mrcal(text: str) -> Camera:
         raise CameraError("it looks like mrcal's .cameramodel but holds no keys; write it again with mrcal")
     lens = str(model.get("lensmodel", ""))
     if lens not in MRCAL_COUNTS:
-        raise CameraError(
-            f"its lens model {lens[:40]!r} is not modelled here; use mrcal-convert-lensmodel to LENSMODEL_OPENCV8"
-        )
+        raise CameraError(f"its lens model {lens[:40]!r} is not modelled here; use mrcal-convert-lensmodel to LENSMODEL_OPENCV8")
     values, size = _numbers(model.get("intrinsics"), "intrinsics"), _numbers(model.get("imagersize"), "imagersize")
     if len(values) != 4 + MRCAL_COUNTS[lens] or len(size) != 2:
         raise CameraError(f"{lens} needs {4 + MRCAL_COUNTS[lens]} intrinsics and an imagersize of 2, not {len(values)} and {len(size)}")

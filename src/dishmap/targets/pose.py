@@ -163,7 +163,7 @@ def _found_again(found: TargetPoses, reference: TargetPoses) -> TargetPoses:
     near = motion < TRACKED_PX
     if near.sum() < TRACKED_SHARE * len(reference):
         raise MeasurementError(
-            f"only {int(near.sum())} of {len(reference)} targets were found again within {TRACKED_PX:g} px of where the reference has them; "
+            f"only {int(near.sum())} of {len(reference)} targets were found again within {TRACKED_PX:g} px of their places in the reference; "
             "the camera or the surface moved too far to track: measure the photograph on its own"
         )
     lost = tuple((int(i), f"it moved by more than {TRACKED_PX:g} px, or something else lies where it was") for i in found.ids[~near])
