@@ -31,7 +31,8 @@ from dishmap.simulate.scene import Scene, Sensor, facing_pose
 from dishmap.targets.builders import dish
 from dishmap.targets.detect import find_ellipses
 from dishmap.targets.identify import Upright, identify
-from dishmap.targets.pose import measure_targets, track_targets
+from dishmap.targets.pose import measure_targets
+from dishmap.targets.track import track_targets
 
 REPEATS = 3 if QUICK else 9
 GOAL_S, GOAL_MB, GOAL_IMPORT_S = 0.35, 250, 0.25

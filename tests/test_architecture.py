@@ -40,7 +40,7 @@ ORDER = [
     # measuring it in the raw pixels
     *("targets.solve", "targets.edges", "targets.light", "targets.pixels", "targets.window", "targets.neighbours"),
     *("targets.adjust", "targets.start", "targets.sensitivity", "targets.scene_noise", "targets.glare", "targets.stages"),
-    *("targets.settle", "targets.pose"),
+    *("targets.settle", "targets.pose", "targets.track"),
     # boards of circles
     *("camera.board_labels", "camera.circle_board"),
     # measuring it as the paper does, and the limit of both

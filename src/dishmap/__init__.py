@@ -41,8 +41,9 @@ if TYPE_CHECKING:
     from dishmap.targets.detect import find_ellipses
     from dishmap.targets.identify import PoseGuess, Upright, identify
     from dishmap.targets.pattern import Pattern, Surface, TargetKind
-    from dishmap.targets.pose import measure_targets, track_targets
+    from dishmap.targets.pose import measure_targets
     from dishmap.targets.stages import Assumptions
+    from dishmap.targets.track import track_targets
     from dishmap.transforms import Pose
 
     __version__: str
@@ -78,7 +79,7 @@ _HOME = {
     "identify": "dishmap.targets.identify",
     "map_photograph": "dishmap.pipeline",
     "measure_targets": "dishmap.targets.pose",
-    "track_targets": "dishmap.targets.pose",
+    "track_targets": "dishmap.targets.track",
     "paper_of": "dishmap.sheet.paper",
     "pattern_sheets": "dishmap.sheet.sheets",
     "plate": "dishmap.targets.builders",

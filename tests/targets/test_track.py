@@ -13,7 +13,8 @@ from dishmap.simulate.render import simulate
 from dishmap.simulate.scene import Scene, Sensor, facing_pose
 from dishmap.targets.builders import dish
 from dishmap.targets.identify import Upright
-from dishmap.targets.pose import TargetPoses, track_targets
+from dishmap.targets.pose import TargetPoses
+from dishmap.targets.track import track_targets
 from dishmap.transforms import Pose
 
 CAMERA = Camera(1000, 1000, np.full(2, 900.0), np.full(2, 499.5))

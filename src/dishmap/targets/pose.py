@@ -19,7 +19,6 @@ from dishmap.errors import CameraError, ImageError, MeasurementError
 from dishmap.quality import Quality, is_rejected, names
 from dishmap.targets.adjust import Adjusted, Priors, by_target, prior_terms
 from dishmap.targets.detect import Detections
-from dishmap.targets.edges import Poses
 from dishmap.targets.identify import Identity
 from dishmap.targets.neighbours import Ink
 from dishmap.targets.pattern import Pattern
@@ -41,7 +40,6 @@ from dishmap.targets.stages import (
     printed_ink,
     regroup,
     start_groups,
-    tracked_groups,
     wholly_inside,
 )
 from dishmap.targets.start import centers_of
@@ -51,8 +49,6 @@ Array = NDArray[Any]
 Index = NDArray[np.int64]
 
 SMALLEST_RADIUS_PX = 2.0
-# How far a tracked target may have moved in the image, and the share of targets that must be found again.
-TRACKED_PX, TRACKED_SHARE = 3.0, 0.5
 # Sums of squares of larger grey levels leave the range of single precision.
 LARGEST_GREY = 1e15
 # Share of an edge that must be left for a target to be measured.
@@ -136,38 +132,7 @@ def measure_targets(
         assumptions = assumptions or Assumptions()
         groups, rejected = start_groups(camera, pattern, detections, identity, assumptions)
         tell = progress or (lambda done, total: None)
-        return _measure(image, camera, pattern, groups, rejected, identity.camera_from_dish, assumptions, tell)
-
-
-def track_targets(
-    image: NDArray[Any], camera: Camera, pattern: Pattern, reference: TargetPoses, assumptions: Assumptions | None = None
-) -> TargetPoses:
-    """Measure the targets of an earlier photograph of the same scene again, each looked for where it was.
-
-    No search and no naming: a target may have moved by up to TRACKED_PX in the image and keeps its name. Targets that moved farther are
-    listed in `rejected`; when fewer than half are found again, the whole is refused. Raises as `measure_targets`.
-    """
-    check_image(image, camera)
-    assumptions = assumptions or Assumptions()
-    with threadpool_limits(limits=1, user_api="blas"):
-        before = Poses(reference.rotation, reference.position_mm)
-        groups, rejected = tracked_groups(camera, pattern, reference.index, before, assumptions)
-        found = _measure(image, camera, pattern, groups, rejected, reference.camera_from_dish, assumptions, lambda done, total: None)
-    return _found_again(found, reference)
-
-
-def _found_again(found: TargetPoses, reference: TargetPoses) -> TargetPoses:
-    """Without the targets that are no longer where they were: what was measured there may be something else."""
-    at = np.searchsorted(reference.index, found.index)
-    motion = np.linalg.norm(found.center_px - reference.center_px[at], axis=1)
-    near = motion < TRACKED_PX
-    if near.sum() < TRACKED_SHARE * len(reference):
-        raise MeasurementError(
-            f"only {int(near.sum())} of {len(reference)} targets were found again within {TRACKED_PX:g} px of their places in the reference; "
-            "the camera or the surface moved too far to track: measure the photograph on its own"
-        )
-    lost = tuple((int(i), f"it moved by more than {TRACKED_PX:g} px, or something else lies where it was") for i in found.ids[~near])
-    return replace(select_targets(found, np.flatnonzero(near)), rejected=tuple(sorted(found.rejected + lost)))
+        return measure_groups(image, camera, pattern, groups, rejected, identity.camera_from_dish, assumptions, tell)
 
 
 # The fields of TargetPoses with one row for each target.
@@ -183,7 +148,7 @@ def select_targets(poses: TargetPoses, rows: Index) -> TargetPoses:
     return replace(poses, **columns)
 
 
-def _measure(
+def measure_groups(
     image: NDArray[Any],
     camera: Camera,
     pattern: Pattern,
@@ -193,6 +158,7 @@ def _measure(
     assumptions: Assumptions,
     tell: Callable[[int, int], None],
 ) -> TargetPoses:
+    """Measure targets from their first poses; `rejected` holds those left out before. See `measure_targets`."""
     total = 2 * len(groups)
     coarse = []
     ink = printed_ink(camera, pattern, groups, camera_from_dish)
