@@ -159,9 +159,9 @@ def start_groups(
 
 
 def tracked_groups(
-    camera: Camera, pattern: Pattern, index: Index, poses: Poses, assumptions: Assumptions
+    camera: Camera, pattern: Pattern, index: Index, poses: Poses, blur_px: Array, assumptions: Assumptions
 ) -> tuple[list[Group], list[tuple[int, str]]]:
-    """Targets number `index` (T,) at poses known beforehand, in groups; and (id, reason) of those that reach beyond the image."""
+    """Targets number `index` (T,) at poses and with blurs (T,) known beforehand, in groups; (id, reason) of those beyond the image."""
     groups: list[Group] = []
     rejected: list[tuple[int, str]] = []
     names = np.array(pattern.kind_names)[index]
@@ -170,6 +170,7 @@ def tracked_groups(
         order = rows[np.argsort(np.linalg.norm(poses.position_mm[rows], axis=1), kind="stable")]
         for part in np.array_split(order, -(-len(order) // GROUP_SIZE)):
             group = _first_group(camera, pattern, pattern.kinds[str(name)], index[part], poses.take(part), assumptions)
+            group = replace(group, state=replace(group.state, blur_px=blur_px[part]))
             inside = wholly_inside(group)
             rejected += [(int(pattern.ids[i]), "it reaches beyond the image") for i in group.index[~inside]]
             if inside.any():

@@ -43,7 +43,7 @@ def track_targets(
     gone = [(int(i), "it is no longer where it was") for i in reference.ids[~there]]
     with threadpool_limits(limits=1, user_api="blas"):
         before = Poses(reference.rotation[rows], reference.position_mm[rows])
-        groups, rejected = tracked_groups(camera, pattern, reference.index[rows], before, assumptions)
+        groups, rejected = tracked_groups(camera, pattern, reference.index[rows], before, reference.blur_px[rows], assumptions)
         found = measure_groups(
             image, camera, pattern, groups, rejected + gone, reference.camera_from_dish, assumptions, lambda done, total: None
         )
