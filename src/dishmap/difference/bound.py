@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dishmap.camera.model import Camera
-from dishmap.difference.changes import TargetChanges, changed_information
+from dishmap.difference.changes import TargetChanges, changed_information, rigid_columns
 from dishmap.difference.joint import Evidence, Sizes, posterior
 from dishmap.difference.model import WAYS, columns_of, smooth_kernel, surfaces_of
 from dishmap.difference.response import pose_response
@@ -78,11 +78,7 @@ def _along(factor: Array, normal: Array, own: Array) -> Array:
 
 def without_rigid(displacement: Array, points: Array) -> Array:
     """Displacements (N, 3, K) of points (N, 3) less their best-fit rigid motion."""
-    columns = np.zeros((len(points), 3, 6))
-    columns[:, :, :3] = np.eye(3)
-    for k in range(3):
-        columns[:, :, 3 + k] = np.cross(np.eye(3)[k], points)
-    flat = columns.reshape(-1, 6)
+    flat = rigid_columns(points).reshape(-1, 6)
     solved = np.linalg.lstsq(flat, displacement.reshape(len(flat), -1), rcond=None)[0]
     return np.asarray(displacement - (flat @ solved).reshape(displacement.shape))
 

@@ -18,7 +18,7 @@ from dishmap.difference.response import pose_response
 from dishmap.errors import MeasurementError
 from dishmap.targets.pattern import Pattern
 from dishmap.targets.pose import TARGET_COLUMNS, TargetPoses, select_targets
-from dishmap.transforms import Pose, rotation_from_vector
+from dishmap.transforms import Pose, cross_matrix, rotation_from_vector
 
 Array = NDArray[Any]
 Index = NDArray[np.int64]
@@ -157,7 +157,7 @@ def rigid_alignment(reference_mm: Array, current_mm: Array, covariance_mm2: Arra
         distance = np.sqrt(np.einsum("ni,nij,nj->n", gap, information, gap))
         cut = ALIGN_CUT * max(float(np.median(distance)), 1e-9)
         weight = np.clip(1 - (distance / cut) ** 2, 0, None) ** 2
-        columns = np.concatenate([np.broadcast_to(np.eye(3), (len(at), 3, 3)), _minus_cross(at - middle)], axis=2)
+        columns = rigid_columns(at - middle)
         weighted = np.swapaxes(columns, 1, 2) @ (information * weight[:, None, None])
         step = np.linalg.solve((weighted @ columns).sum(axis=0), (weighted @ gap[..., None]).sum(axis=0)[:, 0])
         turn = rotation_from_vector(step[3:])
@@ -169,11 +169,9 @@ def rigid_alignment(reference_mm: Array, current_mm: Array, covariance_mm2: Arra
     return Pose(left @ right, pose.translation_mm)
 
 
-def _minus_cross(points: Array) -> Array:
-    """Matrices (N, 3, 3) with which a small turn moves points about the origin."""
-    out = np.zeros((len(points), 3, 3))
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = points[:, 2], -points[:, 1], points[:, 0]
-    return np.asarray(out - np.swapaxes(out, 1, 2))
+def rigid_columns(points: Array) -> Array:
+    """Displacement (N, 3, 6) of points (N, 3) under small moves (mm) and turns (rad) about the origin."""
+    return np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -cross_matrix(points)], axis=2)
 
 
 def _kabsch(a: Array, b: Array) -> Pose:

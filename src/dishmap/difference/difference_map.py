@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from dishmap.camera.model import Camera
-from dishmap.difference.changes import TargetChanges, target_changes
+from dishmap.difference.changes import TargetChanges, rigid_columns, target_changes
 from dishmap.difference.estimate import Hypothesis, JointEstimate, joint_estimate
 from dishmap.difference.model import BLOCKS, rigid_coefficients
 from dishmap.difference.priors import Priors
@@ -147,7 +147,7 @@ class _Frame:
         self.carry = camera_from_dish.inverse() @ changes.moved @ camera_from_dish
         self.carried = self.carry.apply(self.points) - self.points
         self.depth_axis = camera_from_dish.rotation[2]
-        self.rigid = _rigid_columns(self.points)
+        self.rigid = rigid_columns(self.points)
         self.parts_named = estimate.parts_named
         fields = estimate.surfaces.fields
         self.terms = _reported_terms(len(changes))
@@ -218,15 +218,6 @@ def _mixture(parts: list[_Outputs], weights: Array) -> _Outputs:
     return _Outputs(
         np.asarray(mean), np.concatenate(columns, axis=1), np.asarray(sum(w * p.own for w, p in zip(weights, parts, strict=True)))
     )
-
-
-def _rigid_columns(points: Array) -> Array:
-    """Displacement (N, 3, 6) under small moves (mm) and turns (rad) about the dish frame's origin."""
-    out = np.zeros((len(points), 3, 6))
-    out[:, :, :3] = np.eye(3)
-    for k in range(3):
-        out[:, :, 3 + k] = np.cross(np.eye(3)[k], points)
-    return out
 
 
 def _reported_terms(targets: int) -> tuple[tuple[int, int], ...]:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from dishmap.camera.model import Camera
 from dishmap.difference.changes import LEAST_TARGETS, TargetChanges
 from dishmap.difference.joint import RANGES, Evidence, Posterior, Sizes, determined, learn_sizes, misfit, penalty, posterior
-from dishmap.difference.model import BLOCKS, WAYS, Columns, Surfaces, columns_of, curved_change, smooth_kernel, surfaces_of
+from dishmap.difference.model import BLOCKS, WAYS, Columns, Kernel, Surfaces, columns_of, curved_change, smooth_kernel, surfaces_of
 from dishmap.difference.priors import Priors
 from dishmap.errors import InputError, MeasurementError
 from dishmap.targets.pattern import Pattern
@@ -119,10 +119,14 @@ class _Problem:
         self.loose = np.zeros(len(changes), bool)
         self.scale = 1.0
         self.hub = self._hub()
+        # one for each length, the same for all ways
+        self.kernels: dict[float, Kernel] = {}
 
     def columns(self, way: str, length: float) -> Columns:
         """Columns of all unknowns for one way of following and one correlation length."""
-        kernel = smooth_kernel(self.surfaces, length)
+        if length not in self.kernels:
+            self.kernels[length] = smooth_kernel(self.surfaces, length)
+        kernel = self.kernels[length]
         out = columns_of(self.changes, self.pattern, self.camera, self.camera_from_dish, self.surfaces, kernel, way)
         mean = out.mean.copy()
         mean[out.block == BLOCKS.index("expansion")] = self.expansion[0]

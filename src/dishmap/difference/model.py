@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from dishmap.camera.model import Camera
-from dishmap.difference.changes import TargetChanges, small_turn
+from dishmap.difference.changes import TargetChanges, rigid_columns, small_turn
 from dishmap.surface.membrane import Fields, Membrane, Motion, bent, disc_points, membrane, sliding, zernike_values
 from dishmap.targets.pattern import Pattern
 from dishmap.transforms import Pose
@@ -63,7 +63,7 @@ class Surfaces:
 
 def surfaces_of(pattern: Pattern, index: NDArray[np.int64]) -> Surfaces:
     """Fields over the pattern's disc, as fine as targets number `index` can resolve."""
-    radius = field_radius_mm(pattern)
+    radius = pattern.rim_radius_mm
     degree = int(np.clip(np.floor(np.sqrt(2 * len(index)) - 1.5), SMALLEST_DEGREE, LARGEST_DEGREE))
     fields = Fields(pattern.surface, radius, degree)
     form = membrane(fields)
@@ -74,14 +74,6 @@ def surfaces_of(pattern: Pattern, index: NDArray[np.int64]) -> Surfaces:
     projection = np.linalg.solve((over * weight[:, None]).T @ over, (over * weight[:, None]).T)
     slide = sliding(form, len(fields.normal_terms))
     return Surfaces(fields, form, slide, axes, xy, fields.at(xy, axes[..., :2]), value, slope, points, projection)
-
-
-def field_radius_mm(pattern: Pattern) -> float:
-    """Radius of the disc on which fields live: the surface's rim, or a circle around all ink."""
-    if pattern.surface.diameter_mm is not None:
-        return pattern.surface.diameter_mm / 2
-    extent = np.array([pattern.kinds[name].extent_mm for name in pattern.kind_names])
-    return float((np.linalg.norm(pattern.center_mm[:, :2], axis=1) + extent).max())
 
 
 @dataclass(frozen=True)
@@ -194,8 +186,7 @@ def rigid_coefficients(coefficients: Array) -> Array:
 
 def _rigid(points: Array, axes: Array) -> Motion:
     """Moves (mm) and turns (rad) about the dish frame's origin, scaled to say nothing."""
-    turn = np.stack([np.cross(np.eye(3)[k], points) for k in range(3)], axis=-1) * FREE_TURN_RAD
-    move = np.concatenate([np.broadcast_to(FREE_MOVE_MM * np.eye(3), (len(points), 3, 3)), turn], axis=-1)
+    move = rigid_columns(points) * np.array([FREE_MOVE_MM] * 3 + [FREE_TURN_RAD] * 3)
     gradient = np.zeros((len(points), 3, 2, 6))
     for k in range(3):
         gradient[..., 3 + k] = np.cross(np.eye(3)[k], axes[..., :2], axisb=1, axisc=1) * FREE_TURN_RAD

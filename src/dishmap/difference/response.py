@@ -15,6 +15,7 @@ from dishmap.camera.model import Camera
 from dishmap.targets.edges import Poses, project_printed
 from dishmap.targets.pattern import Pattern, bent_print_mm
 from dishmap.targets.sensitivity import edge_normals, outline_samples
+from dishmap.targets.start import nominal_poses
 from dishmap.transforms import Pose
 
 Array = NDArray[Any]
@@ -34,11 +35,11 @@ def pose_response(camera: Camera, pattern: Pattern, index: NDArray[np.int64], ca
     """
     by_camera = np.zeros((len(index), 6, len(camera.parameters)))
     by_strain = np.zeros((len(index), 6, 3))
-    rotation, position = camera_from_dish.rotation @ pattern.axes[index], camera_from_dish.apply(pattern.center_mm[index])
+    poses = nominal_poses(pattern, index, camera_from_dish)
     names = np.array(pattern.kind_names)[index]
     for name in np.unique(names):
         rows = np.flatnonzero(names == name)
-        by_camera[rows], by_strain[rows] = _response(camera, pattern, Poses(rotation[rows], position[rows]), index[rows])
+        by_camera[rows], by_strain[rows] = _response(camera, pattern, poses.take(rows), index[rows])
     return by_camera, by_strain
 
 

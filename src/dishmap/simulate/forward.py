@@ -30,11 +30,7 @@ FIELD_PART = 0.999
 
 def rim_radius_mm(scene: Scene) -> float:
     """The radius at which a Zernike term is 1: the surface's rim, or the outermost ink of a pattern without one."""
-    pattern = scene.pattern
-    if pattern.surface.diameter_mm is not None:
-        return pattern.surface.diameter_mm / 2
-    extent = np.array([kind.extent_mm for kind in map(pattern.kind_of, range(len(pattern)))])
-    return float((np.linalg.norm(pattern.center_mm[:, :2], axis=1) + extent).max())
+    return scene.pattern.rim_radius_mm
 
 
 def printed_points(scene: Scene, index: ArrayLike, xy_mm: ArrayLike) -> Array:

@@ -22,7 +22,7 @@ from dishmap.targets.pattern import Pattern, TargetKind
 from dishmap.targets.pixels import BLUR, OFFSET_MM, OFFSET_PX, TONE, RingSums, State, coverage_columns, rings_of, without_light
 from dishmap.targets.solve import inverse_scaled, solve_each
 from dishmap.targets.stages import FIRST_LOG_BLUR_SIGMA, Assumptions, Group, layout
-from dishmap.targets.start import centers_of
+from dishmap.targets.start import centers_of, nominal_poses
 from dishmap.transforms import Pose
 
 Array = NDArray[Any]
@@ -96,7 +96,7 @@ def pattern_information(
     known, rest = [*range(6), OFFSET_MM], [OFFSET_PX, BLUR, TONE]
     for name in np.unique(names):
         rows = np.flatnonzero(names == name)
-        poses = Poses(camera_from_dish.rotation @ pattern.axes[index[rows]], camera_from_dish.apply(pattern.center_mm[index[rows]]))
+        poses = nominal_poses(pattern, index[rows], camera_from_dish)
         curvature = pattern.curvature_per_mm[index[rows]]
         group = _group(camera, pattern.kinds[str(name)], poses, curvature, psf_sigma_px, FREE_NORMAL_SIGMA_RAD, Assumptions())
         full = _information(group, float(group.state.blur_px[0])) * contrast_to_noise**2

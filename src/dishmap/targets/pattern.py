@@ -220,6 +220,14 @@ class Pattern:
         axes = self.axes
         return self.surface.curvature_per_mm(self.center_mm[:, :2], axes[..., 0], axes[..., 1])
 
+    @cached_property
+    def rim_radius_mm(self) -> float:
+        """The radius at which a Zernike term is 1: the surface's rim, or the outermost ink of a pattern without one."""
+        if self.surface.diameter_mm is not None:
+            return self.surface.diameter_mm / 2
+        extent = np.array([self.kinds[name].extent_mm for name in self.kind_names])
+        return float((np.linalg.norm(self.center_mm[:, :2], axis=1) + extent).max())
+
     def kind_of(self, index: int) -> TargetKind:
         """The TargetKind of target number `index` (not its id)."""
         return self.kinds[self.kind_names[index]]
