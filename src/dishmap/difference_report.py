@@ -5,14 +5,11 @@ The same input gives the same page, byte for byte, with the same versions of the
 
 from __future__ import annotations
 
-import platform
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dishmap import __version__
 from dishmap.compare import PAPER, SHAPE, Difference, DifferenceTable
 from dishmap.difference.difference_map import Considered, DifferenceMap
 from dishmap.difference_assumptions import SIZES, assumptions, way_words
@@ -24,7 +21,7 @@ from dishmap.plot.difference_scene import difference_scene, exaggeration
 from dishmap.plot.maps import sigma_map
 from dishmap.plot.outlines import check_picture
 from dishmap.quality import MEANING, Quality, names
-from dishmap.report import LIBRARIES
+from dishmap.report import inputs_section
 from dishmap.surface.zernike import term_name
 from dishmap.verdict import Fact, id_list, number, targets
 
@@ -60,7 +57,7 @@ def difference_report(result: Difference, image: NDArray[np.generic] | None, tit
         _hypotheses(result),
         _quality(result),
         _table(result),
-        _inputs(inputs),
+        inputs_section(inputs),
     ]
     return page(title, body, _scripts(result))
 
@@ -327,19 +324,6 @@ def _fixed(values: Array, decimals: int) -> list[str]:
 
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
-
-
-def _inputs(inputs: dict[str, str]) -> str:
-    versions = [("dishmap", __version__), ("Python", platform.python_version()), *((name, _version(name)) for name in LIBRARIES)]
-    rows = [*inputs.items(), *((f"version of {name}", text) for name, text in versions)]
-    return section("Inputs and versions", table(("what", "value"), rows, (0, 1)))
-
-
-def _version(library: str) -> str:
-    try:
-        return version(library)
-    except PackageNotFoundError:
-        return "unknown"
 
 
 def _scripts(result: Difference) -> list[str]:

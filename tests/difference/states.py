@@ -31,10 +31,9 @@ NORMAL_SIGMA_RAD = 2e-4
 STEP_MM = 0.05
 
 
-@lru_cache(maxsize=4)
-def information(pattern_size: int = 0) -> Array:
+@lru_cache(maxsize=1)
+def information() -> Array:
     """Fisher information (N, 7, 7) of one photograph of DISH."""
-    del pattern_size
     return pattern_information(CAMERA, DISH, np.arange(len(DISH)), AT, CONTRAST, PSF_PX)
 
 

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import os
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.compare import DifferenceTable
-from dishmap.errors import InputError
-from dishmap.io.points_file import bits_of, fixed, id_of, value_of
+from dishmap.io.points_file import fixed, table_rows, table_text
 from dishmap.quality import names
 
 Array = NDArray[np.float64]
@@ -23,7 +19,6 @@ VALUES = ("displacement_mm", "depth_change_mm", "shape_mm")
 SIGMAS = ("sigma_displacement_mm", "sigma_depth_change_mm", "sigma_shape_mm")
 MOTION = ("du_px", "dv_px")
 COLUMNS = ("id", *NOMINAL, *VALUES, *SIGMAS, *MOTION, "quality")
-LARGEST_FILE_BYTES = 100_000_000
 # Blue for towards the back, light grey for no change, red for towards the focus: told apart by colour-blind people too.
 BACK, STILL, FRONT = (33.0, 102.0, 172.0), (235.0, 235.0, 235.0), (178.0, 24.0, 43.0)
 # The scale of colours reaches at least so many median sigmas, so that noise alone stays pale.
@@ -75,38 +70,12 @@ def colour_scale_mm(table: DifferenceTable) -> float:
 
 def read_difference(path: str | os.PathLike[str]) -> DifferenceTable:
     """Read `difference.csv`. Raises InputError, naming the file and the line, when it is not exactly such a table."""
-    try:
-        if os.path.getsize(path) > LARGEST_FILE_BYTES:
-            raise InputError(f"{path} is larger than {LARGEST_FILE_BYTES // 10**6} MB, so it is no table of differences")
-        text = Path(path).read_bytes().decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is no table of differences: it is not text in UTF-8") from error
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot read the table of differences {path}: {getattr(error, 'strerror', None) or error}") from error
-    return parse_difference(text, str(path))
+    return parse_difference(table_text(path, "differences"), str(path))
 
 
 def parse_difference(text: str, source: str = "the table of differences") -> DifferenceTable:
     """Make a DifferenceTable of the text of `difference.csv`; `source` stands in messages. Raises InputError."""
-    try:
-        rows = list(csv.reader(io.StringIO(text), strict=True))
-    except csv.Error as error:
-        raise InputError(f"{source} is no CSV: {error}") from error
-    if not rows or tuple(rows[0]) != COLUMNS:
-        raise InputError(f"{source} is no table of differences: its first line must be {','.join(COLUMNS)}")
-    ids, values, quality = [], [], []
-    for number, row in enumerate(rows[1:], start=2):
-        try:
-            if len(row) != len(COLUMNS):
-                raise InputError(f"{len(COLUMNS)} columns are needed, not {len(row)}")
-            ids.append(id_of(row[0]))
-            values.append([value_of(name, cell, name in SIGMAS) for name, cell in zip(COLUMNS[1:-1], row[1:-1], strict=True)])
-            quality.append(bits_of(row[-1]))
-        except InputError as error:
-            raise InputError(f"{source}, line {number}: {error}") from error
-    if len(set(ids)) < len(ids):
-        raise InputError(f"{source}: the id {next(i for i in ids if ids.count(i) > 1)} stands in it twice")
-    table = np.asarray(values, dtype=float).reshape(len(ids), len(COLUMNS) - 2)
+    ids, table, quality = table_rows(text, source, "differences", COLUMNS, SIGMAS)
     columns = {name: table[:, 3 + k] for k, name in enumerate((*VALUES, *SIGMAS))}
     return DifferenceTable(
         ids=np.asarray(ids, dtype=np.int64),

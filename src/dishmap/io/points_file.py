@@ -6,6 +6,7 @@ import csv
 import io
 import math
 import os
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -96,40 +97,56 @@ def format_ply(table: PointTable) -> str:
     return "\n".join(head) + "\n"
 
 
-def read_points(path: str | os.PathLike[str]) -> PointTable:
-    """Read `points.csv`. Raises InputError, naming the file and the line, when it is not exactly such a table."""
+def table_text(path: str | os.PathLike[str], what: str) -> str:
+    """Text of a table of `what`. Raises InputError when the file cannot be read or is no text."""
     try:
         if os.path.getsize(path) > LARGEST_FILE_BYTES:
-            raise InputError(f"{path} is larger than {LARGEST_FILE_BYTES // 10**6} MB, so it is no table of points")
+            raise InputError(f"{path} is larger than {LARGEST_FILE_BYTES // 10**6} MB, so it is no table of {what}")
         text = Path(path).read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} is no table of points: it is not text in UTF-8") from error
+        raise InputError(f"{path} is no table of {what}: it is not text in UTF-8") from error
     except (OSError, ValueError) as error:
-        raise InputError(f"cannot read the table of points {path}: {getattr(error, 'strerror', None) or error}") from error
-    return parse_points(text, str(path))
+        raise InputError(f"cannot read the table of {what} {path}: {getattr(error, 'strerror', None) or error}") from error
+    return text
 
 
-def parse_points(text: str, source: str = "the table of points") -> PointTable:
-    """Make a PointTable of the text of `points.csv`; `source` stands in messages. Raises InputError."""
+def table_rows(
+    text: str, source: str, what: str, columns: tuple[str, ...], sigmas: Collection[str]
+) -> tuple[list[int], NDArray[np.float64], list[int]]:
+    """Ids, numbers (N, columns but the first and last) and quality bits of a table of `what`; cells of `sigmas` may be empty.
+
+    Raises InputError, naming the line, when the text is not exactly such a table.
+    """
     try:
         rows = list(csv.reader(io.StringIO(text), strict=True))
     except csv.Error as error:
         raise InputError(f"{source} is no CSV: {error}") from error
-    if not rows or tuple(rows[0]) != COLUMNS:
-        raise InputError(f"{source} is no table of points: its first line must be {','.join(COLUMNS)}")
+    if not rows or tuple(rows[0]) != columns:
+        raise InputError(f"{source} is no table of {what}: its first line must be {','.join(columns)}")
     ids, values, quality = [], [], []
     for number, row in enumerate(rows[1:], start=2):
         try:
-            if len(row) != len(COLUMNS):
-                raise InputError(f"{len(COLUMNS)} columns are needed, not {len(row)}")
+            if len(row) != len(columns):
+                raise InputError(f"{len(columns)} columns are needed, not {len(row)}")
             ids.append(id_of(row[0]))
-            values.append([value_of(name, cell, name in SIGMAS) for name, cell in zip(COLUMNS[1:-1], row[1:-1], strict=True)])
+            values.append([value_of(name, cell, name in sigmas) for name, cell in zip(columns[1:-1], row[1:-1], strict=True)])
             quality.append(bits_of(row[-1]))
         except InputError as error:
             raise InputError(f"{source}, line {number}: {error}") from error
     if len(set(ids)) < len(ids):
         raise InputError(f"{source}: the id {next(i for i in ids if ids.count(i) > 1)} stands in it twice")
-    table = np.asarray(values, dtype=float).reshape(len(ids), len(COLUMNS) - 2)
+    table = np.asarray(values, dtype=float).reshape(len(ids), len(columns) - 2)
+    return ids, table, quality
+
+
+def read_points(path: str | os.PathLike[str]) -> PointTable:
+    """Read `points.csv`. Raises InputError, naming the file and the line, when it is not exactly such a table."""
+    return parse_points(table_text(path, "points"), str(path))
+
+
+def parse_points(text: str, source: str = "the table of points") -> PointTable:
+    """Make a PointTable of the text of `points.csv`; `source` stands in messages. Raises InputError."""
+    ids, table, quality = table_rows(text, source, "points", COLUMNS, SIGMAS)
     normal = table[:, 3:6]
     off = np.flatnonzero(np.abs(np.linalg.norm(normal, axis=1) - 1) > NORMAL_TOLERANCE)
     if off.size:
