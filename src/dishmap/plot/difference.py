@@ -12,20 +12,19 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 from scipy.stats import chi
 
 from dishmap.difference_verdict import ROUNDING, TOLD_SIGMAS
 from dishmap.plot.canvas import BLUE, DIVERGING, FAINT, INK, ORANGE, RED, SEQUENTIAL, Array, as_svg, new_figure
+from dishmap.plot.maps import dish_axes, fill_map, map_figure
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
-MAP_WIDTH_IN, MAP_BODY_IN, MAP_HEIGHTS_IN = 6.2, 4.3, (1.2, 6.0)
+# Lower than other maps: a legend stands above.
+BODY_IN = 4.3
 CHART_IN = (6.2, 4.4)
-LEVELS = 20
-MARGIN = 0.08
 # The scale of a change reaches at least so many sigmas, so that noise never looks like a strong change.
 LEAST_SIGMAS = 3.0
 # Names beside points stay readable up to so many.
@@ -48,10 +47,10 @@ def change_map(xy_mm: Array, change_mm: Array, sigma_mm: Array, aside: Bools, id
 
     sigma_mm (N,): NaN where unknown; changes that it tells from zero have a dark outline. aside: not used, drawn as crosses.
     """
-    figure, axes = _map_figure(xy_mm)
+    figure, axes = map_figure(xy_mm, BODY_IN)
     used = ~aside
     norm = Normalize(-(limit := _limit(change_mm[used], sigma_mm[used])), limit)
-    _fill(axes, xy_mm[used], change_mm[used], norm, DIVERGING)
+    fill_map(axes, xy_mm[used], change_mm[used], norm, DIVERGING)
     told = ~(np.abs(change_mm) < TOLD_SIGMAS * sigma_mm)
     for some, size, edge, words in (
         (used & told, 30, INK, f"beyond {TOLD_SIGMAS:g} sigma"),
@@ -65,14 +64,14 @@ def change_map(xy_mm: Array, change_mm: Array, sigma_mm: Array, aside: Bools, id
     if np.isfinite(sigma_mm).any() or aside.any():
         _legend(figure)
     figure.colorbar(_mappable(norm, DIVERGING), ax=axes, label=label)
-    _dish_axes(axes, xy_mm)
+    dish_axes(axes, xy_mm)
     return figure
 
 
 @as_svg
 def misfit_map(xy_mm: Array, misfit: Array, aside: Bools, ids: Ints) -> Figure:
     """Misfits (N,), in sigmas, at points (N, 2); not filled, since they say nothing of what lies between. aside: drawn as crosses."""
-    figure, axes = _map_figure(xy_mm)
+    figure, axes = map_figure(xy_mm, BODY_IN)
     used = ~aside
     norm = Normalize(0.0, max(LEAST_MISFIT_SHOWN, float(misfit[used].max(initial=0.0))))
     x, y = xy_mm[used].T
@@ -81,14 +80,14 @@ def misfit_map(xy_mm: Array, misfit: Array, aside: Bools, ids: Ints) -> Figure:
     if aside.any():
         _legend(figure)
     figure.colorbar(_mappable(norm, SEQUENTIAL), ax=axes, label="misfit (sigmas)")
-    _dish_axes(axes, xy_mm)
+    dish_axes(axes, xy_mm)
     return figure
 
 
 @as_svg
 def ratio_map_chart(place_mm: Array, pair: Ints, ratio: Array, used: Bools) -> Figure:
     """The paper's ratios (M,) of pairs (M, 2) of targets at place_mm (T, 2), less one, in percent; pairs not used are grey."""
-    figure, axes = _map_figure(place_mm)
+    figure, axes = map_figure(place_mm, BODY_IN)
     percent = 100 * (ratio - 1)
     limit = float(np.abs(percent[used]).max(initial=0.0)) or 1.0
     norm = Normalize(-limit, limit)
@@ -105,7 +104,7 @@ def ratio_map_chart(place_mm: Array, pair: Ints, ratio: Array, used: Bools) -> F
         axes.scatter(x, y, c=percent[used], cmap=DIVERGING, norm=norm, s=9, zorder=2)
     axes.scatter(place_mm[:, 0], place_mm[:, 1], s=10, color=INK, zorder=4)
     figure.colorbar(_mappable(norm, DIVERGING), ax=axes, label="ratio of distances - 1 (%)")
-    _dish_axes(axes, place_mm)
+    dish_axes(axes, place_mm)
     return figure
 
 
@@ -175,33 +174,3 @@ def _crosses(axes: Axes, xy_mm: Array, aside: Bools, ids: Ints) -> None:
 def _legend(figure: Figure) -> None:
     # beside the axes a wide legend would make them smaller
     figure.legend(loc="outside upper left", borderpad=0.2, ncols=3, columnspacing=1.0, handletextpad=0.3, fontsize=9.5)
-
-
-def _map_figure(xy_mm: Array) -> tuple[Figure, Axes]:
-    """A figure of the height that the points' outline needs, with room above for a legend."""
-    along, across = np.ptp(xy_mm, axis=0) + 2 * MARGIN * _span(xy_mm)
-    return new_figure(MAP_WIDTH_IN, float(np.clip(MAP_BODY_IN * across / along, *MAP_HEIGHTS_IN)) + 0.9, "compressed")
-
-
-def _span(xy_mm: Array) -> float:
-    return float(np.ptp(xy_mm, axis=0).max()) or 1.0
-
-
-def _fill(axes: Axes, xy_mm: Array, values: Array, norm: Normalize, colors: str) -> None:
-    """Filled contours, linear between neighbouring points; nothing where the points span no area."""
-    flat = len(xy_mm) < 3 or np.linalg.matrix_rank(xy_mm - xy_mm.mean(axis=0), tol=1e-6 * _span(xy_mm)) < 2
-    if flat or not np.ptp(values) > 0:
-        return
-    levels = norm.inverse(np.linspace(0.0, 1.0, LEVELS + 1))
-    # rounding must not leave the extreme points outside the outermost levels
-    levels[0], levels[-1] = min(levels[0], values.min()), max(levels[-1], values.max())
-    filled = axes.tricontourf(Triangulation(*xy_mm.T), values, levels=levels, cmap=colors, norm=norm, alpha=0.85, zorder=1)
-    filled.set_edgecolor("face")
-
-
-def _dish_axes(axes: Axes, xy_mm: Array) -> None:
-    """Equal scales, a margin around the points, and units."""
-    low, high = xy_mm.min(axis=0), xy_mm.max(axis=0)
-    margin = MARGIN * _span(xy_mm)
-    axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), xlabel="x (mm)", ylabel="y (mm)")
-    axes.set_aspect("equal", adjustable="box")

@@ -17,6 +17,8 @@ from dishmap.plot.canvas import BLUE, DIVERGING, FAINT, INK, ORANGE, RED, SEQUEN
 MAP_WIDTH_IN, MAP_BODY_IN, MAP_HEIGHTS_IN = 6.2, 4.6, (1.2, 6.0)
 CHART_IN = (6.2, 4.4)
 LEVELS = 20
+# Free room around the points, as a share of their span.
+MARGIN = 0.08
 # Names beside points stay readable up to so many.
 MOST_NAMES = 12
 # An arrow of the longest kind takes this part of the map's width; strays beyond this quantile may be longer,
@@ -32,12 +34,12 @@ POINTS_PER_BIN, FEWEST_BINS, MOST_BINS = 6, 8, 40
 @as_svg
 def residual_map(xy_mm: Array, residual_mm: Array, off: NDArray[np.bool_], ids: NDArray[np.int64], label: str) -> Figure:
     """Residuals (N,) to the surface at points (N, 2), on a scale that is symmetric about zero; points off the surface as crosses."""
-    figure, axes = _map_figure(xy_mm)
+    figure, axes = map_figure(xy_mm)
     on = ~off
     largest = float(np.abs(residual_mm[on]).max()) if on.any() else 0.0
     largest = largest or float(np.abs(residual_mm).max()) or 1.0
     norm = Normalize(-largest, largest)
-    _fill(axes, xy_mm[on], residual_mm[on], norm, DIVERGING)
+    fill_map(axes, xy_mm[on], residual_mm[on], norm, DIVERGING)
     dots = axes.scatter(
         xy_mm[on, 0], xy_mm[on, 1], c=residual_mm[on], cmap=DIVERGING, norm=norm, s=26, edgecolors=INK, linewidths=0.6, zorder=3
     )
@@ -49,30 +51,30 @@ def residual_map(xy_mm: Array, residual_mm: Array, off: NDArray[np.bool_], ids: 
         if off.sum() <= MOST_NAMES:
             _name(axes, xy_mm[off], ids[off])
     figure.colorbar(dots, ax=axes, label=label)
-    _dish_axes(axes, xy_mm)
+    dish_axes(axes, xy_mm)
     return figure
 
 
 @as_svg
 def sigma_map(xy_mm: Array, sigma: Array, label: str) -> Figure:
     """Sigmas (N,) at points (N, 2), filled between them."""
-    figure, axes = _map_figure(xy_mm)
+    figure, axes = map_figure(xy_mm)
     norm = color_norm(sigma)
-    _fill(axes, xy_mm, sigma, norm, SEQUENTIAL)
+    fill_map(axes, xy_mm, sigma, norm, SEQUENTIAL)
     dots = axes.scatter(xy_mm[:, 0], xy_mm[:, 1], c=sigma, cmap=SEQUENTIAL, norm=norm, s=26, edgecolors=INK, linewidths=0.6, zorder=3)
     bar = figure.colorbar(dots, ax=axes, label=label)
     if isinstance(norm, LogNorm):
         # plain numbers instead of powers of ten
         bar.set_ticks(ticks := _ticks(float(norm.vmin or 0), float(norm.vmax or 0)), labels=[f"{tick:g}" for tick in ticks], minor=False)
         bar.minorticks_off()
-    _dish_axes(axes, xy_mm)
+    dish_axes(axes, xy_mm)
     return figure
 
 
 @as_svg
 def normals_map(xy_mm: Array, lean_rad: Array, reference: str) -> Figure:
     """Arrows at points (N, 2) showing how far, and to which side, normals lean from a reference: lean_rad (N, 2)."""
-    figure, axes = _map_figure(xy_mm)
+    figure, axes = map_figure(xy_mm)
     lean_deg = np.degrees(lean_rad)
     length_deg = np.hypot(*lean_deg.T)
     typical = float(np.quantile(length_deg, ARROW_QUANTILE)) or float(length_deg.max()) or 1.0
@@ -99,7 +101,7 @@ def normals_map(xy_mm: Array, lean_rad: Array, reference: str) -> Figure:
     axes.quiverkey(arrows, 0.16, top, key, f"{key:g}° from the {reference}", labelpos="E", coordinates="figure", color=BLUE)
     if long.any():
         figure.text(0.97, top, "longer", color=ORANGE, ha="right", va="center")
-    _dish_axes(axes, xy_mm)
+    dish_axes(axes, xy_mm)
     return figure
 
 
@@ -133,10 +135,10 @@ def _normal_curve(x: Array, spread: float) -> Array:
     return np.asarray(np.exp(-0.5 * (x / spread) ** 2) / (spread * np.sqrt(2 * np.pi)))
 
 
-def _map_figure(xy_mm: Array) -> tuple[Figure, Axes]:
-    """A figure of the height that the points' outline needs."""
-    along, across = np.ptp(xy_mm, axis=0) + 0.16 * _span(xy_mm)
-    return new_figure(MAP_WIDTH_IN, float(np.clip(MAP_BODY_IN * across / along, *MAP_HEIGHTS_IN)) + 0.9, "compressed")
+def map_figure(xy_mm: Array, body_in: float = MAP_BODY_IN) -> tuple[Figure, Axes]:
+    """A figure of the height that the points' outline needs, `body_in` for a square one."""
+    along, across = np.ptp(xy_mm, axis=0) + 2 * MARGIN * _span(xy_mm)
+    return new_figure(MAP_WIDTH_IN, float(np.clip(body_in * across / along, *MAP_HEIGHTS_IN)) + 0.9, "compressed")
 
 
 def _ticks(low: float, high: float) -> list[float]:
@@ -149,7 +151,7 @@ def _span(xy_mm: Array) -> float:
     return float(np.ptp(xy_mm, axis=0).max()) or 1.0
 
 
-def _fill(axes: Axes, xy_mm: Array, values: Array, norm: Normalize, colors: str) -> None:
+def fill_map(axes: Axes, xy_mm: Array, values: Array, norm: Normalize, colors: str) -> None:
     """Filled contours, linear between neighbouring points; nothing where the points span no area."""
     triangles = _triangulation(xy_mm)
     if triangles is None or not np.ptp(values) > 0:
@@ -173,9 +175,9 @@ def _name(axes: Axes, xy_mm: Array, ids: NDArray[np.int64]) -> None:
         axes.annotate(str(ident), (x, y), xytext=(6, 6), textcoords="offset points", color=RED, fontsize=10, zorder=5)
 
 
-def _dish_axes(axes: Axes, xy_mm: Array) -> None:
+def dish_axes(axes: Axes, xy_mm: Array) -> None:
     """Equal scales, a margin around the points, and units."""
     low, high = xy_mm.min(axis=0), xy_mm.max(axis=0)
-    margin = 0.08 * _span(xy_mm)
+    margin = MARGIN * _span(xy_mm)
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), xlabel="x (mm)", ylabel="y (mm)")
     axes.set_aspect("equal", adjustable="box")

@@ -28,11 +28,13 @@ from dishmap.targets.pixels import (
     ring_sums,
     without_light,
 )
-from dishmap.targets.solve import solve_scaled
+from dishmap.targets.solve import solve_each, solve_scaled
 from dishmap.transforms import rotation_from_vector
 
 Array = NDArray[Any]
 
+# The parameters that say where a target is, and how far its ink spread.
+POSE_AND_OFFSET = [*range(6), OFFSET_MM]
 # A step moves no edge by more than this, so that the linear model holds (edges are about a blur wide).
 LARGEST_STEP_PX = 1.5
 LARGEST_TURN_RAD = 0.2
@@ -125,6 +127,22 @@ def prior_terms(poses: Poses, state: State, priors: Priors) -> tuple[Array, Arra
         precision[:, column] = sigma**-2
         pull[:, column] = mean - value
     return precision, precision * pull
+
+
+def on_pose_and_offset(information: Array, precision: Array, steps: Array) -> tuple[Array, Array]:
+    """Information (T, G, G) of a fit reduced to (move along camera axes in mm, turn about target axes in rad, edge offset in mm).
+
+    precision (T, G): of the priors; those of blur, tone curve and blooming are kept, and these three eliminated. steps (T, 3, 3): axes of
+    the moves. Returns the information (T, 7, 7), without the priors on the seven, and the turn (T, 7, 7) from the fit's axes.
+    """
+    rest = [OFFSET_PX, BLUR, TONE]
+    full = information.copy()
+    full[:, rest, rest] += precision[:, rest]
+    cross = full[:, POSE_AND_OFFSET][:, :, rest]
+    kept = full[:, POSE_AND_OFFSET][:, :, POSE_AND_OFFSET] - cross @ solve_each(full[:, rest][:, :, rest], np.swapaxes(cross, 1, 2))
+    axes = np.zeros_like(kept)
+    axes[:, :3, :3], axes[:, 3:, 3:] = steps, np.eye(4)
+    return axes @ kept @ np.swapaxes(axes, 1, 2), axes
 
 
 def adjust(batch: Batch, pixels: RingPixels, poses: Poses, state: State, weighting: Weighting, steps: int, enough: float = 1.0) -> Adjusted:

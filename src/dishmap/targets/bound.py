@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from dishmap.camera.model import Camera
 from dishmap.errors import InputError
-from dishmap.targets.adjust import Batch, Priors, by_target, prior_terms
+from dishmap.targets.adjust import Batch, Priors, by_target, on_pose_and_offset, prior_terms
 from dishmap.targets.edges import Poses
 from dishmap.targets.light import light_columns
 from dishmap.targets.pattern import Pattern, TargetKind
-from dishmap.targets.pixels import BLUR, OFFSET_MM, OFFSET_PX, TONE, RingSums, State, coverage_columns, rings_of, without_light
-from dishmap.targets.solve import inverse_scaled, solve_each
+from dishmap.targets.pixels import RingSums, State, coverage_columns, rings_of, without_light
+from dishmap.targets.solve import inverse_scaled
 from dishmap.targets.stages import FIRST_LOG_BLUR_SIGMA, Assumptions, Group, layout
 from dishmap.targets.start import centers_of, nominal_poses
 from dishmap.transforms import Pose
@@ -93,7 +93,6 @@ def pattern_information(
     """
     out = np.zeros((len(index), 7, 7))
     names = np.array(pattern.kind_names)[index]
-    known, rest = [*range(6), OFFSET_MM], [OFFSET_PX, BLUR, TONE]
     for name in np.unique(names):
         rows = np.flatnonzero(names == name)
         poses = nominal_poses(pattern, index[rows], camera_from_dish)
@@ -101,12 +100,7 @@ def pattern_information(
         group = _group(camera, pattern.kinds[str(name)], poses, curvature, psf_sigma_px, FREE_NORMAL_SIGMA_RAD, Assumptions())
         full = _information(group, float(group.state.blur_px[0])) * contrast_to_noise**2
         precision, _ = prior_terms(poses, group.state, group.batch.priors)
-        full[:, rest, rest] += precision[:, rest]
-        cross = full[:, known][:, :, rest]
-        kept = full[:, known][:, :, known] - cross @ solve_each(full[:, rest][:, :, rest], np.swapaxes(cross, 1, 2))
-        axes = np.zeros((len(rows), 7, 7))
-        axes[:, :3, :3], axes[:, 3:, 3:] = poses.steps, np.eye(4)
-        out[rows] = axes @ kept @ np.swapaxes(axes, 1, 2)
+        out[rows], _ = on_pose_and_offset(full, precision, poses.steps)
     return out
 
 

@@ -17,16 +17,16 @@ from threadpoolctl import threadpool_limits
 from dishmap.camera.model import Camera
 from dishmap.errors import CameraError, ImageError, MeasurementError
 from dishmap.quality import Quality, is_rejected, names
-from dishmap.targets.adjust import Adjusted, Priors, by_target, prior_terms
+from dishmap.targets.adjust import POSE_AND_OFFSET, Adjusted, Priors, by_target, on_pose_and_offset, prior_terms
 from dishmap.targets.detect import Detections
 from dishmap.targets.identify import Identity
 from dishmap.targets.neighbours import Ink
 from dishmap.targets.pattern import Pattern
-from dishmap.targets.pixels import BLUR, GEOMETRY, OFFSET_MM, OFFSET_PX, TONE, RingPixels
+from dishmap.targets.pixels import GEOMETRY, OFFSET_MM, OFFSET_PX, RingPixels
 from dishmap.targets.scene_noise import NoiseModel, inflation_of
 from dishmap.targets.sensitivity import calibration_jacobian
 from dishmap.targets.settle import with_clear_light, with_learnt_normals, with_likelier_normals
-from dishmap.targets.solve import inverse_scaled, solve_each
+from dishmap.targets.solve import inverse_scaled
 from dishmap.targets.stages import (
     OCCLUDED_BELOW,
     Assumptions,
@@ -280,31 +280,24 @@ def _results(image: NDArray[Any], group: Group, adjusted: Adjusted, pixels: Ring
         "noise": sigma,
         "kept": kept,
     }
-    columns["information"], columns["pull"], columns["prior"] = _likelihood(batch.priors, adjusted, turned, noise.inflation * allowance)
+    columns["information"], columns["pull"], columns["prior"] = _likelihood(batch.priors, adjusted, noise.inflation * allowance)
     columns["quality"] = _quality(image, group, adjusted, pixels, columns, data + prior, light[:, 0])
     return columns
 
 
-def _likelihood(priors: Priors, adjusted: Adjusted, turned: Array, enlarged: Array) -> tuple[Array, Array, Array]:
+def _likelihood(priors: Priors, adjusted: Adjusted, enlarged: Array) -> tuple[Array, Array, Array]:
     """What the pixels alone say of pose and edge offset: information (T, 7, 7) and pull (T, 7) at the estimate; the priors (T, 7).
 
     There the pixels' pull and the priors' cancel, so the pixels pull against the priors. Blur, tone curve and blooming keep
     their priors and are eliminated. `enlarged` (T,) divides both, as it multiplies covariances.
     """
     precision, pull = prior_terms(adjusted.poses, adjusted.state, priors)
-    known, rest = [*range(6), OFFSET_MM], [OFFSET_PX, BLUR, TONE]
-    full = adjusted.data_information.copy()
-    full[:, rest, rest] += precision[:, rest]
-    cross = full[:, known][:, :, rest]
-    solved = solve_each(full[:, rest][:, :, rest], np.swapaxes(cross, 1, 2))
-    information = full[:, known][:, :, known] - cross @ solved
-    axes = np.zeros((len(full), 7, 7))
-    axes[:, :6, :6], axes[:, 6, 6] = turned, 1.0
-    against = -pull[:, known]
+    information, axes = on_pose_and_offset(adjusted.data_information, precision, adjusted.poses.steps)
+    against = -pull[:, POSE_AND_OFFSET]
     return (
-        axes @ information @ np.swapaxes(axes, 1, 2) / enlarged[:, None, None],
+        information / enlarged[:, None, None],
         np.einsum("tij,tj->ti", axes, against) / enlarged[:, None],
-        precision[:, known],
+        precision[:, POSE_AND_OFFSET],
     )
 
 
