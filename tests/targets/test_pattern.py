@@ -12,7 +12,7 @@ from scipy.integrate import quad
 
 from dishmap.errors import PatternError
 from dishmap.targets.builders import concentric, disc, dish, multi_circular, odd_kind, plate, ring, whycon
-from dishmap.targets.pattern import Pattern, Surface, TargetKind, bent_print_mm
+from dishmap.targets.pattern import GridLine, Pattern, Polygon, Surface, TargetKind, bent_print_mm
 
 ROUNDING = 1e-12
 # central differences with steps of 1e-3 mm of a surface curved by 1/600 mm
@@ -155,7 +155,6 @@ def test_what_a_kind_can_tell() -> None:
 @pytest.mark.parametrize(
     ("circles", "text"),
     [
-        ([], "at least one circle"),
         ([(0, 0, 5, True), (6, 0, 5, True)], "circles 0 and 1 of a target kind cross; they must be disjoint or nested"),
         ([(0, 0, 5, True), (3, 0, 3, False)], "circles 0 and 1 of a target kind cross"),
         ([(0, 0, 5, True), (0, 0, 5, False)], "circles 0 and 1 of a target kind cross"),
@@ -239,3 +238,92 @@ def test_records_cannot_be_changed() -> None:
     with pytest.raises(AttributeError):
         pattern.name = "other"  # type: ignore[misc]
     assert len(pattern) == 2
+
+
+def squares(**changes: object) -> Pattern:
+    """Two squares of 4 mm on a lattice of 12 mm."""
+    square = Polygon([[-2.0, -2], [2, -2], [2, 2], [-2, 2]])
+    kinds = {"disc": TargetKind(np.zeros((0, 2)), [], [], (square,))}
+    return two_targets(**{"kinds": kinds, "lattice": [[0, 0], [1, 0]], **changes})
+
+
+def crossings(**changes: object) -> Pattern:
+    """Four crossings of two lines along x and two along y."""
+    fields: dict = {
+        "ids": [0, 1, 2, 3],
+        "kinds": {"crossing": TargetKind(np.zeros((0, 2)), [], [])},
+        "kind_names": ("crossing",) * 4,
+        "center_mm": [[0.0, 0, 0], [12, 0, 0], [0, 12, 0], [12, 12, 0]],
+        "x_axis": np.tile([1.0, 0, 0], (4, 1)),
+        "normal": np.tile([0.0, 0, 1], (4, 1)),
+        "lattice": [[0, 0], [1, 0], [0, 1], [1, 1]],
+        "lines": [GridLine(ids, 1.0, 6.0) for ids in ((0, 1), (2, 3), (0, 2), (1, 3))],
+    }
+    return two_targets(**{**fields, **changes})
+
+
+def test_grids_of_squares_and_of_lines() -> None:
+    assert squares().is_grid
+    assert crossings().is_grid
+    assert not two_targets().is_grid
+    assert squares().kind_of(0).extent_mm == pytest.approx(np.sqrt(8))
+    assert crossings().kind_of(0).extent_mm == 0
+
+
+@pytest.mark.parametrize(
+    ("make", "changes", "text"),
+    [
+        (crossings, {"lattice": None}, "target 0 has no circles, so it belongs to a grid and needs its place in the lattice"),
+        (crossings, {"lines": []}, "targets of kind 'crossing' have no ink and no lines cross there"),
+        (crossings, {"lines": [GridLine((0, 1), 1.0)]}, "1 lines go through target 0; two cross at each target"),
+        (crossings, {"lines": [GridLine((0, 9), 1.0)]}, "a line goes through target 9, which the pattern does not have"),
+        (squares, {"lattice": [[0, 0], [0, 0]]}, r"two targets have the place \[0, 0\] in the lattice"),
+        (squares, {"lattice": [[0, 0]]}, "each target of a grid needs its place"),
+        (two_targets, {"lattice": [[0, 0], [1, 0]]}, "target 3 is made of circles; a pattern is made of circles or is a grid, not both"),
+        (two_targets, {"lines": [GridLine((3, 7), 1.0)]}, "lines go through the targets of a grid"),
+    ],
+)
+def test_impossible_grids(make, changes: dict, text: str) -> None:
+    with pytest.raises(PatternError, match=text):
+        make(**changes)
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: GridLine((1,), 1.0), "two or more different targets"),
+        (lambda: GridLine((1, 2, 1), 1.0), "two or more different targets"),
+        (lambda: GridLine((1, 2), 0.0), "width_mm must lie between"),
+        (lambda: GridLine((1, 2), 1.0, -1.0), "overhang_mm must lie between"),
+        (lambda: Polygon([[0, 0], [1, 0]]), "three or more corners_mm"),
+        (lambda: Polygon([[0, 0], [1, 0], [2, 0]]), "holds no ink"),
+        (lambda: Surface("cylinder"), "a cylinder needs radius_mm"),
+        (lambda: Surface("cylinder", radius_mm=0.0), "radius_mm must not be 0"),
+    ],
+)
+def test_impossible_parts_of_grids(make, text: str) -> None:
+    with pytest.raises(PatternError, match=text):
+        make()
+
+
+@pytest.mark.parametrize("radius_mm", [57.0, -57.0])
+def test_cylinder(radius_mm: float) -> None:
+    """A bulging cylinder's axis lies at z = -R, a hollow one's at z = +|R|; the normal is radial and has z > 0."""
+    surface = Surface("cylinder", radius_mm=radius_mm)
+    xy = np.array([[0.0, 3.0], [20.0, -8.0], [-50.0, 100.0]])
+    axis = np.stack([np.zeros(3), xy[:, 1], np.full(3, -radius_mm)], axis=1)
+    point = np.column_stack([xy, surface.height_mm(xy)])
+    radial = (point - axis) * np.sign(radius_mm)
+    assert np.abs(np.linalg.norm(radial, axis=1) - 57).max() < 1e-12
+    assert np.abs(surface.normal(xy) - radial / 57).max() < 1e-12
+    step = 1e-3
+    for k, move in enumerate(np.eye(2) * step):
+        rise = (surface.height_mm(xy + move) - surface.height_mm(xy - move)) / (2 * step)
+        assert np.abs(surface.slope(xy)[:, k] - rise).max() < DIFFERENCE
+        turn = (surface.slope(xy + move) - surface.slope(xy - move)) / (2 * step)
+        assert np.abs(surface.bend_per_mm(xy)[..., k] - turn).max() < DIFFERENCE
+    # along the circle a bulging surface bends away from its normal by 1/R, along the axis not at all
+    along = np.cross([0.0, 1.0, 0.0], surface.normal(xy))
+    bend = surface.curvature_per_mm(xy, along, np.tile([0.0, 1, 0], (3, 1)))
+    assert np.abs(bend - np.diag([-1 / radius_mm, 0])).max() < 1e-12
+    assert np.isnan(surface.height_mm(np.array([[60.0, 0]]))).all()

@@ -298,7 +298,7 @@ class _Problem:
             # without the size of prints nothing tells how points slide: they do what a membrane does
             return ("least_strain",)
         # on a plane the slide does not depend on the displacement along the normal
-        return ("normal", "any") if self.pattern.surface.kind == "plane" else tuple(WAYS)
+        return tuple(WAYS) if self.pattern.surface.kind == "paraboloid" else ("normal", "any")
 
 
 def _finite(hypotheses: list[Hypothesis]) -> list[Hypothesis]:

@@ -137,7 +137,7 @@ def deform(deformation: Deformation, surface: Surface, points_mm: ArrayLike, rim
     xy = points[..., :2]
     rise = displacement_mm(deformation, xy, rim_radius_mm)
     moved = points * (1 + 1e-6 * deformation.expansion_ppm) + rise[..., None] * surface.normal(xy)
-    if deformation.slide == "least_strain" and surface.kind != "plane":
+    if deformation.slide == "least_strain" and surface.kind == "paraboloid":
         moved += _slide_mm(deformation, surface, xy, rim_radius_mm)
     return deformation.motion.apply(moved)
 

@@ -125,16 +125,16 @@ class _Frame:
 
 def _frame(surface: Surface, xy: Array) -> _Frame:
     count = len(xy)
-    bend = 0.0 if surface.focal_length_mm is None or surface.kind == "plane" else 0.5 / surface.focal_length_mm
+    slope, bend = surface.slope(xy), surface.bend_per_mm(xy)
     tangent, tangent_by = np.zeros((count, 3, 2)), np.zeros((count, 3, 2, 2))
     tangent[:, 0, 0] = tangent[:, 1, 1] = 1
-    tangent[:, 2] = bend * xy
-    tangent_by[:, 2, 0, 0] = tangent_by[:, 2, 1, 1] = bend
-    upward = np.concatenate([-bend * xy, np.ones((count, 1))], axis=1)
+    tangent[:, 2] = slope
+    tangent_by[:, 2] = bend
+    upward = np.concatenate([-slope, np.ones((count, 1))], axis=1)
     length = np.linalg.norm(upward, axis=1)
     upward_by = np.zeros((count, 3, 2))
-    upward_by[:, 0, 0] = upward_by[:, 1, 1] = -bend
-    length_by = bend * bend * xy / length[:, None]
+    upward_by[:, :2] = -bend
+    length_by = np.einsum("ni,nij->nj", slope, bend) / length[:, None]
     normal = upward / length[:, None]
     normal_by = (upward_by - normal[:, :, None] * length_by[:, None]) / length[:, None, None]
     return _Frame(tangent, tangent_by, normal, normal_by)

@@ -1,8 +1,12 @@
-"""What is printed and where: circles in target kinds, targets on a nominal surface.
+"""What is printed and where: circles or polygons in target kinds, lines through targets, targets on a nominal surface.
 
 A target is a small set of circles in its own plane; disc, ring, concentric rings, WhyCon-like ring and the paper's
 multi-circular group are all instances of `TargetKind`. Circles are disjoint or nested, and nested ones alternate between
 dark and light inside, so that the ink's coverage is the signed sum of discs.
+
+A *grid* is a pattern whose targets lie on a lattice and look alike: separate squares (a kind with one polygon), or the crossings
+of lines (`GridLine`; a kind without ink of its own, or with the ink of an orientation mark beside it). Each target of a grid has its
+place (column, row) in the lattice. A pattern is made of circles or is a grid, not both.
 
 Pattern (dish) frame: origin at the vertex of the nominal surface, z along the boresight towards the focus and the camera.
 """
@@ -19,7 +23,7 @@ from dishmap.errors import PatternError
 
 Array = NDArray[np.float64]
 
-SURFACE_KINDS = ("plane", "paraboloid")
+SURFACE_KINDS = ("plane", "paraboloid", "cylinder")
 # Axes in a file may carry rounding; 1e-6 is what 7 digits leave.
 AXIS_TOLERANCE = 1e-5
 # Larger than any dish a camera looks at; a pattern in metres or micrometres falls outside.
@@ -28,34 +32,69 @@ SMALLEST_RADIUS_MM, LARGEST_MM = 0.01, 1e5
 
 @dataclass(frozen=True)
 class Surface:
-    """The nominal surface: `plane` (z = 0) or `paraboloid` (z = rho^2 / 4f) with its rim's diameter."""
+    """The nominal surface: `plane` (z = 0), `paraboloid` (z = rho^2 / 4f) with its rim's diameter, or `cylinder`.
+
+    A cylinder's axis is parallel to y and it touches z = 0 along x = 0; with a positive radius it bulges towards the camera
+    (z <= 0), with a negative one it is hollow. Its height is one of the half that faces the camera.
+    """
 
     kind: str = "plane"
     diameter_mm: float | None = None
     focal_length_mm: float | None = None
+    radius_mm: float | None = None
 
     def __post_init__(self) -> None:
         if self.kind not in SURFACE_KINDS:
             raise PatternError(f"unknown surface {self.kind!r}; use one of {', '.join(SURFACE_KINDS)}")
         if self.kind == "paraboloid" and self.focal_length_mm is None:
             raise PatternError("a paraboloid needs focal_length_mm")
+        if self.kind == "cylinder" and self.radius_mm is None:
+            raise PatternError("a cylinder needs radius_mm (positive: it bulges towards the camera; negative: it is hollow)")
         for name in ("diameter_mm", "focal_length_mm"):
             value = getattr(self, name)
             if value is not None and not 0 < value < LARGEST_MM:
                 raise PatternError(f"the surface's {name} must lie between 0 and {LARGEST_MM:g} mm, not {value}")
+        if self.radius_mm is not None and not 0 < abs(self.radius_mm) < LARGEST_MM:
+            raise PatternError(f"the surface's radius_mm must not be 0 and lie within {LARGEST_MM:g} mm, not {self.radius_mm}")
 
     def height_mm(self, xy_mm: Array) -> Array:
-        """Height z of the nominal surface at (..., 2)."""
+        """Height z of the nominal surface at (..., 2); NaN beside a cylinder."""
         xy = np.asarray(xy_mm, dtype=float)
-        if self.focal_length_mm is None or self.kind == "plane":
-            return np.zeros(xy.shape[:-1])
-        return np.asarray((xy**2).sum(axis=-1) / (4 * self.focal_length_mm))
+        if self.kind == "paraboloid" and self.focal_length_mm is not None:
+            return np.asarray((xy**2).sum(axis=-1) / (4 * self.focal_length_mm))
+        if self.kind == "cylinder" and self.radius_mm is not None:
+            return np.asarray(np.sign(self.radius_mm) * (self._cylinder_root(xy) - abs(self.radius_mm)))
+        return np.zeros(xy.shape[:-1])
+
+    def _cylinder_root(self, xy: Array) -> Array:
+        assert self.radius_mm is not None
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.sqrt(self.radius_mm**2 - xy[..., 0] ** 2))
+
+    def slope(self, xy_mm: Array) -> Array:
+        """Derivatives (..., 2) of the height by x and y at (..., 2)."""
+        xy = np.asarray(xy_mm, dtype=float)
+        if self.kind == "paraboloid" and self.focal_length_mm is not None:
+            return np.asarray(xy * (0.5 / self.focal_length_mm))
+        out = np.zeros(xy.shape)
+        if self.kind == "cylinder" and self.radius_mm is not None:
+            out[..., 0] = -np.sign(self.radius_mm) * xy[..., 0] / self._cylinder_root(xy)
+        return out
+
+    def bend_per_mm(self, xy_mm: Array) -> Array:
+        """Second derivatives (..., 2, 2) of the height by x and y at (..., 2)."""
+        xy = np.asarray(xy_mm, dtype=float)
+        if self.kind == "paraboloid" and self.focal_length_mm is not None:
+            return np.broadcast_to(0.5 / self.focal_length_mm * np.eye(2), (*xy.shape[:-1], 2, 2)).copy()
+        out = np.zeros((*xy.shape[:-1], 2, 2))
+        if self.kind == "cylinder" and self.radius_mm is not None:
+            out[..., 0, 0] = -np.sign(self.radius_mm) * self.radius_mm**2 / self._cylinder_root(xy) ** 3
+        return out
 
     def normal(self, xy_mm: Array) -> Array:
         """Unit normal (..., 3) towards the focus at (..., 2)."""
         xy = np.asarray(xy_mm, dtype=float)
-        curvature = 0.0 if self.focal_length_mm is None or self.kind == "plane" else 0.5 / self.focal_length_mm
-        n = np.concatenate([-xy * curvature, np.ones((*xy.shape[:-1], 1))], axis=-1)
+        n = np.concatenate([-self.slope(xy), np.ones((*xy.shape[:-1], 1))], axis=-1)
         return np.asarray(n / np.linalg.norm(n, axis=-1, keepdims=True))
 
     def curvature_per_mm(self, xy_mm: Array, x_axis: Array, y_axis: Array) -> Array:
@@ -64,29 +103,67 @@ class Surface:
         A printed point at (x, y) of a target stands off its tangent plane by half of [x y] K [x y]^T along the normal.
         """
         axes = np.stack([x_axis, y_axis], axis=-2)[..., :2]
-        if self.focal_length_mm is None or self.kind == "plane":
-            return np.zeros((*axes.shape[:-1], 2))
         nz = self.normal(xy_mm)[..., 2]
-        return np.asarray(nz[..., None, None] / (2 * self.focal_length_mm) * (axes @ np.swapaxes(axes, -1, -2)))
+        return np.asarray(nz[..., None, None] * (axes @ self.bend_per_mm(xy_mm) @ np.swapaxes(axes, -1, -2)))
+
+
+@dataclass(frozen=True)
+class Polygon:
+    """A closed polygon of a target kind: corners_mm (K, 2) in the target's plane; dark: its inside is ink, else ground."""
+
+    corners_mm: Array
+    dark: bool = True
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "corners_mm", np.asarray(self.corners_mm, dtype=float).reshape(-1, 2))
+        if len(self.corners_mm) < 3 or not (np.isfinite(self.corners_mm).all() and (np.abs(self.corners_mm) < LARGEST_MM).all()):
+            raise PatternError(f"a polygon needs three or more corners_mm, finite and within {LARGEST_MM:g} mm")
+        x, y = self.corners_mm.T
+        area = 0.5 * abs(float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))))
+        if area < SMALLEST_RADIUS_MM**2:
+            raise PatternError(f"a polygon of {area:.3g} mm^2 holds no ink; its corners_mm must not lie on a line")
+
+
+@dataclass(frozen=True)
+class GridLine:
+    """A printed line of uniform width through targets: their ids in the line's order, and how far it goes on beyond both ends."""
+
+    ids: tuple[int, ...]
+    width_mm: float
+    overhang_mm: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "ids", tuple(int(i) for i in self.ids))
+        if len(self.ids) < 2 or len(set(self.ids)) < len(self.ids):
+            raise PatternError("a line goes through two or more different targets")
+        if not SMALLEST_RADIUS_MM <= self.width_mm < LARGEST_MM:
+            raise PatternError(f"a line's width_mm must lie between {SMALLEST_RADIUS_MM} and {LARGEST_MM:g}, not {self.width_mm}")
+        if not 0 <= self.overhang_mm < LARGEST_MM:
+            raise PatternError(f"a line's overhang_mm must lie between 0 and {LARGEST_MM:g}, not {self.overhang_mm}")
 
 
 @dataclass(frozen=True)
 class TargetKind:
-    """Circles of one kind of target, in the target's plane.
+    """The ink of one kind of target, in the target's plane: circles, or polygons, or none (the crossing of two lines).
 
-    center_mm (C, 2); radius_mm (C,); dark (C,) is true where the circle's inside is ink, false where it is ground.
+    center_mm (C, 2); radius_mm (C,); dark (C,) is true where the circle's inside is ink, false where it is ground. Polygons follow the
+    circles' rule: disjoint or nested, alternating between dark and light.
     """
 
     center_mm: Array
     radius_mm: Array
     dark: NDArray[np.bool_]
+    polygons: tuple[Polygon, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "center_mm", np.asarray(self.center_mm, dtype=float).reshape(-1, 2))
         object.__setattr__(self, "radius_mm", np.asarray(self.radius_mm, dtype=float).reshape(-1))
         object.__setattr__(self, "dark", np.asarray(self.dark, dtype=bool).reshape(-1))
-        if not len(self.radius_mm) or not (len(self.center_mm) == len(self.radius_mm) == len(self.dark)):
-            raise PatternError("a target kind needs at least one circle, each with center_mm, radius_mm and inside")
+        object.__setattr__(self, "polygons", tuple(self.polygons))
+        if not len(self.center_mm) == len(self.radius_mm) == len(self.dark):
+            raise PatternError("each circle of a target kind needs center_mm, radius_mm and inside")
+        if len(self.radius_mm) and self.polygons:
+            raise PatternError("a target kind is made of circles or of polygons, not of both")
         if not (np.isfinite(self.center_mm).all() and (np.abs(self.center_mm) < LARGEST_MM).all()):
             raise PatternError("a circle's center_mm must be finite numbers in mm")
         good = (self.radius_mm >= SMALLEST_RADIUS_MM) & (self.radius_mm < LARGEST_MM)
@@ -139,13 +216,15 @@ class TargetKind:
 
     @cached_property
     def extent_mm(self) -> float:
-        """Radius about the target's origin that holds all of its ink."""
-        return float((np.linalg.norm(self.center_mm, axis=1) + self.radius_mm).max())
+        """Radius about the target's origin that holds all of its own ink; 0 for the crossing of two lines."""
+        circles = np.linalg.norm(self.center_mm, axis=1) + self.radius_mm
+        corners = [np.linalg.norm(polygon.corners_mm, axis=1).max() for polygon in self.polygons]
+        return float(max([*circles, *corners], default=0.0))
 
     @property
     def turns_freely(self) -> bool:
         """True when all circles share the origin, so that a turn about the normal changes nothing."""
-        return bool(np.abs(self.center_mm).max() < 1e-9)
+        return bool(np.abs(self.center_mm).max(initial=0.0) < 1e-9 and not self.polygons)
 
     @property
     def has_light_edges(self) -> bool:
@@ -157,8 +236,9 @@ class TargetKind:
 class Pattern:
     """Targets on a nominal surface, in the dish frame.
 
-    ids (N,); kind_index (N,) into `kind_names`; center_mm, x_axis, normal (N, 3); `kinds[kind_names[i]]` is a TargetKind.
-    Raises PatternError when arrays disagree, ids repeat, axes are not orthonormal or targets overlap.
+    ids (N,); center_mm, x_axis, normal (N, 3); `kinds[kind_names[i]]` is a TargetKind. lattice (N, 2): column and row of each target of
+    a grid, None for a pattern of circles; columns run along x_axis, rows along y; lines: of a grid of lines. Raises PatternError when
+    arrays disagree, ids repeat, axes are not orthonormal, targets overlap, or a grid is not whole.
     """
 
     name: str
@@ -169,10 +249,15 @@ class Pattern:
     center_mm: Array
     x_axis: Array
     normal: Array
+    lattice: NDArray[np.int64] | None = None
+    lines: tuple[GridLine, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("center_mm", "x_axis", "normal"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float).reshape(-1, 3))
+        object.__setattr__(self, "lines", tuple(self.lines))
+        if self.lattice is not None:
+            object.__setattr__(self, "lattice", np.asarray(self.lattice, dtype=np.int64).reshape(-1, 2))
         object.__setattr__(self, "ids", np.asarray(self.ids, dtype=np.int64).reshape(-1))
         object.__setattr__(self, "kind_names", tuple(self.kind_names))
         self._check()
@@ -197,17 +282,55 @@ class Pattern:
             bad = int(np.argmax(np.nan_to_num(np.abs(lengths - 1).max(axis=0) + np.abs(dot), nan=np.inf)))
             raise PatternError(f"x_axis and normal of target {self.ids[bad]} must be unit vectors at right angles")
         self._check_overlap()
+        self._check_grid()
+
+    def _check_grid(self) -> None:
+        """Raise PatternError unless the pattern is all circles, or a whole grid."""
+        round_ = np.array([len(self.kinds[name].radius_mm) > 0 for name in self.kind_names])
+        if self.lattice is None:
+            if not round_.all():
+                first = self.ids[~round_][0]
+                raise PatternError(f"target {first} has no circles, so it belongs to a grid and needs its place in the lattice")
+            if self.lines:
+                raise PatternError("lines go through the targets of a grid; give each target its place in the lattice")
+            return
+        if round_.any():
+            raise PatternError(f"target {self.ids[round_][0]} is made of circles; a pattern is made of circles or is a grid, not both")
+        if len(self.lattice) != len(self.ids):
+            raise PatternError("each target of a grid needs its place (column, row) in the lattice")
+        places, counts = np.unique(self.lattice, axis=0, return_counts=True)
+        if (counts > 1).any():
+            raise PatternError(f"two targets have the place {places[counts > 1][0].tolist()} in the lattice; places must differ")
+        self._check_lines()
+
+    def _check_lines(self) -> None:
+        through = [i for line in self.lines for i in line.ids]
+        unknown = sorted(set(through) - set(self.ids.tolist()))
+        if unknown:
+            raise PatternError(f"a line goes through target {unknown[0]}, which the pattern does not have")
+        if self.lines and sorted(through) != sorted(2 * self.ids.tolist()):
+            counts = {int(i): through.count(int(i)) for i in self.ids}
+            bad = next(i for i, count in counts.items() if count != 2)
+            raise PatternError(f"{counts[bad]} lines go through target {bad}; two cross at each target of a grid of lines")
+        inkless = [name for name in self.kind_names if not self.kinds[name].polygons]
+        if not self.lines and inkless:
+            raise PatternError(f"targets of kind {inkless[0]!r} have no ink and no lines cross there; give the pattern lines or polygons")
 
     def _check_overlap(self) -> None:
         from scipy.spatial import cKDTree
 
         extent = np.array([self.kinds[k].extent_mm for k in self.kind_names])
-        for i, j in cKDTree(self.center_mm).query_pairs(2 * extent.max()):
-            if np.linalg.norm(self.center_mm[i] - self.center_mm[j]) < 1e-6 + 0.5 * (extent[i] + extent[j]):
+        for i, j in cKDTree(self.center_mm).query_pairs(max(2 * extent.max(), 1e-6)):
+            if np.linalg.norm(self.center_mm[i] - self.center_mm[j]) < 1e-6 + 0.5 * (extent[i] + extent[j]) * (not self.lines):
                 raise PatternError(f"targets {self.ids[i]} and {self.ids[j]} lie on top of each other")
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    @property
+    def is_grid(self) -> bool:
+        """True for squares or crossings on a lattice, False for targets made of circles."""
+        return self.lattice is not None
 
     @cached_property
     def axes(self) -> Array:
