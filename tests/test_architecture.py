@@ -66,7 +66,7 @@ ORDER = [
     *("io.atomic", "io.image_header", "io.images", "io.picture_file", "io.pose_file", "io.camera_formats", "io.camera_file"),
     "io.pattern_file",
     *("io.scenario_file", "io.truth_file", "io.points_file", "io.measurement_file", "io.results"),
-    *("io.difference_file", "io.difference_results", "io.sheet_file"),
+    *("io.difference_file", "io.difference_results", "io.board_file", "io.sheet_file"),
     # people: what a map says in words, in pictures, on a page
     *("verdict", "plot.canvas", "plot.photograph", "plot.maps", "plot.outlines", "plot.scene", "plot.calibration", "page", "report"),
     "calibration_report",
@@ -75,7 +75,7 @@ ORDER = [
     *("difference_report",),
     # the program
     *("cli.terminal", "cli.options", "cli.prior_options", "cli.outcome", "cli.difference_outcome"),
-    *("cli.calibrate", "cli.pattern", "cli.sheet", "cli.simulate", "cli.undistort"),
+    *("cli.board_options", "cli.calibrate", "cli.pattern", "cli.sheet", "cli.simulate", "cli.undistort"),
     *("cli.map", "cli.diff", "cli.demo", "cli.app", "__main__"),
 ]
 

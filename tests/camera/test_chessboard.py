@@ -172,13 +172,21 @@ def test_board_positions() -> None:
     assert board.shape == (12, 3)
     assert board[1].tolist() == [12.5, 0, 0]
     assert board[4].tolist() == [0, 12.5, 0]
+    printed = chessboard_mm((4, 3), (12.4, 12.6))
+    assert printed[5].tolist() == [12.4, 12.6, 0]
+
+
+def test_a_square_board_of_uneven_squares_is_refused(board: tuple[NDArray[np.uint8], Array]) -> None:
+    with pytest.raises(InputError, match="a chessboard of 6x6 corners looks the same after a quarter turn, .* print one with more corners"):
+        find_boards([("a", board[0])], (6, 6), (19.9, 20.1))
 
 
 @pytest.mark.parametrize(
     ("corners", "square_mm", "message"),
     [
         ((14, 19), 0.01, "squares of 0.01 mm make a board of 14x19 corners 0.18 mm long.*is it in millimetres?"),
-        ((14, 19), 1300.0, "boards up to 10 m are taken"),
+        ((14, 19), 1300.0, "squares of 1300 mm make a board of 14x19 corners 23400 mm long"),
+        ((11, 8), 1000.0, "boards up to 5 m are taken: is it in millimetres?"),
         ((9, 6), -10.0, "is it in millimetres"),
         ((9, 6), float("nan"), "is it in millimetres"),
         ((2, 6), 10.0, "a board needs 3 to 200 inner corners a side .where four squares meet., not 2x6"),

@@ -42,3 +42,12 @@ def mapped(shot: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, 
 def short_report(monkeypatch: pytest.MonkeyPatch) -> None:
     """A report of one line, for tests that look at the other files: drawing takes longer than measuring."""
     monkeypatch.setattr("dishmap.report.map_report", lambda result, image, title, inputs: f"<title>{title}</title>")
+
+
+@pytest.fixture
+def no_checks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A calibration that is not checked and whose report has one line, for tests that look at the camera and at words."""
+    from dishmap.calibration_report import Checks
+
+    monkeypatch.setattr("dishmap.cli.calibrate._checks", lambda result, choice, working_mm: Checks(choice))
+    monkeypatch.setattr("dishmap.calibration_report.calibration_report", lambda result, title, *others: f"<title>{title}</title>")

@@ -12,6 +12,7 @@ from cli_words import dishmap, refused
 
 from dishmap.camera import charuco
 from dishmap.camera.model import Camera
+from dishmap.cli import board_options
 from dishmap.cli import calibrate as words_of
 from dishmap.io.camera_file import read_camera, read_views
 from dishmap.io.camera_formats import SUFFIXES
@@ -40,8 +41,8 @@ def ring_photographs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 def test_the_words_are_those_of_the_library() -> None:
-    assert words_of.BOARDS == boards.BOARDS
-    assert words_of.DICTIONARIES == charuco.DICTIONARIES
+    assert board_options.BOARDS == boards.BOARDS == tuple(board_options.TAKES)
+    assert board_options.DICTIONARIES == charuco.DICTIONARIES
     assert set(words_of.FORMATS) == set(SUFFIXES)
 
 
@@ -67,6 +68,7 @@ def test_a_ring_board(ring_photographs: list[Path], tmp_path: Path) -> None:
     assert re.search(r"next: the board in ", done.stdout)
 
 
+@pytest.mark.usefixtures("no_checks")
 def test_a_pattern_file_as_board(ring_photographs: list[Path], tmp_path: Path) -> None:
     write_pattern(tmp_path / "board.json", BOARD)
     out = tmp_path / "camera.yaml"
@@ -80,14 +82,17 @@ def test_a_pattern_file_as_board(ring_photographs: list[Path], tmp_path: Path) -
     ("words", "message"),
     [
         (["--board", "rings", "--corners", "7x5"], "--board rings needs --corners and --square-mm"),
-        (["--board", "hexagons"], "--board takes chessboard, charuco, circles, acircles, rings or a pattern file"),
-        (["--board", "board.json", "--corners", "7x5"], "a pattern file says itself what is printed"),
+        (["--board", "hexagons"], "--board takes chessboard, charuco, circles, acircles, rings or a file that says what is printed"),
+        (["--board", "board.json", "--corners", "7x5"], "a board's file says itself what is printed; leave out --corners"),
         (
             ["--board", "chessboard", "--corners", "7x5", "--square-mm", 20, "--radius-mm", 3],
             "--radius-mm means nothing to --board chessboard",
         ),
         (["--board", "rings", "--corners", "7x5", "--square-mm", 20, "--marker-mm", 3], "--marker-mm means nothing to --board rings"),
-        (["--board", "nowhere.json"], "nowhere.json"),
+        (["--board", "nowhere.json"], "cannot read the board file nowhere.json: No such file"),
+        (["--board", "sheets.pdf"], "or a file that says what is printed (board.json, pattern.json as"),
+        (["--board", "chessboard", "--corners", "7x5", "--square-mm", 20, "--no-orientation-marks"], "--no-orientation-marks means nothing"),
+        (["--board", "chessboard", "--corners", "7x5", "--square-mm", 20, "--dictionary", "4x4_50"], "--dictionary means nothing to"),
         (["--board", "circles", "--corners", "7x5", "--square-mm", 20], "no photograph shows the board: ring0.png"),
         (["--board", "charuco", "--corners", "7x5", "--square-mm", 20], "only 0 corners of the ChArUco board were found"),
         (["--board", "rings", "--corners", "7x5", "--square-mm", 20, "--radius-mm", 12], "targets 0 and 1 touch"),
@@ -100,6 +105,7 @@ def test_mistakes(ring_photographs: list[Path], tmp_path: Path, words: list[obje
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.usefixtures("no_checks")
 def test_a_format_that_cannot_hold_the_lens(ring_photographs: list[Path], tmp_path: Path) -> None:
     words = ["--board", "rings", "--corners", "7x5", "--square-mm", 20, "--lens", 5, "--format", "kalibr", "--out", tmp_path / "c.yaml"]
     assert "Kalibr's radtan lens has 4 coefficients, and this camera 5; calibrate with --lens 4" in refused(

@@ -115,7 +115,7 @@ def test_targets_without_a_free_cut_lie_on_tabs_and_are_said(tmp_path: Path) -> 
         ([*CHESS, "--pitch-mm", 4], "--pitch-mm is nothing of --kind chessboard, which takes --corners, --square-mm"),
         (["board", "--kind", "chessboard", "--corners", "1x6", "--square-mm", 20], "3 to 200 inner corners"),
         (["board", "--kind", "chessboard", "--corners", "190x190", "--square-mm", 500], "is it in millimetres"),
-        (["board", "--kind", "chessboard", "--corners", "90x90", "--square-mm", 100], "up to 400 are made"),
+        (["board", "--kind", "chessboard", "--corners", "60x60", "--square-mm", 80, "--paper", "200x200"], "up to 400 are made"),
         (["board", "--kind", "charuco", "--corners", "9x6", "--square-mm", 20, "--marker-mm", 25], "smaller than its squares"),
         (["board", "--kind", "charuco", "--corners", "20x20", "--square-mm", 20, "--dictionary", "4x4_50"], "marks 0 to 49, not 50"),
         (["board", "--kind", "charuco", "--corners", "9x6", "--square-mm", 20, "--corner-marks", "aruco"], "marks of its own"),

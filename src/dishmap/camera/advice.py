@@ -59,8 +59,11 @@ class Suggestion:
     after_px: float
 
 
-def suggestions(calibration: Calibration, count: int = SUGGESTIONS) -> tuple[Suggestion, ...]:
-    """The views that lower the expected error of shapes most, each on top of those before it; none where nothing is to be gained."""
+def suggestions(calibration: Calibration, count: int = SUGGESTIONS, distance_mm: float | None = None) -> tuple[Suggestion, ...]:
+    """The views that lower the expected error of shapes most, each on top of those before it; none where nothing is to be gained.
+
+    distance_mm: where shapes are to be measured, by default where the boards were.
+    """
     bundle, problem = calibration.bundle, calibration.problem
     noise = calibration.sigma_px * calibration.inflation
     if noise <= 0:
@@ -70,7 +73,7 @@ def suggestions(calibration: Calibration, count: int = SUGGESTIONS) -> tuple[Sug
     equations = ba.normal_equations(bundle, corners, free, calibration.weights, prior)
     information = ba.reduced(equations)[0].sum(axis=0) + np.diag(equations.prior)
     candidates = {words: _information(calibration, pose, free, prior) for words, pose in _candidate_poses(calibration).items()}
-    distance = working_distance_mm(calibration)
+    distance = distance_mm or working_distance_mm(calibration)
     out: list[Suggestion] = []
     before = _error(bundle.camera, information, noise, distance)
     for _ in range(count):

@@ -33,7 +33,7 @@ WINDOW_OF_SQUARE, WINDOW_RANGE_PX, FARTHEST_PX = 0.16, (2, 10), 3.0
 def find_charuco_boards(
     photographs: Iterable[tuple[str, Gray]],
     corners: tuple[int, int],
-    square_mm: float,
+    square_mm: float | tuple[float, float],
     marker_mm: float | None = None,
     dictionary: str = "5x5_1000",
     total: int = 0,
@@ -41,20 +41,22 @@ def find_charuco_boards(
 ) -> BoardSearch:
     """Find a ChArUco board in each photograph (name, gray).
 
-    corners: inner corners along x and y (squares less one); marker_mm: side of a mark, three quarters of a square by default.
+    corners: inner corners along x and y (squares less one); square_mm: side of a square, or its sides along x and y as a printer made
+    them; marker_mm: side of a mark, three quarters of a square by default.
     Raises InputError for an impossible board, and as `find_boards` does.
     """
     board_mm = chessboard_mm(corners, square_mm)
     if dictionary not in DICTIONARIES:
         raise InputError(f"unknown dictionary {dictionary!r}; use one of {', '.join(DICTIONARIES)}")
-    side = MARKER_PART * square_mm if marker_mm is None else marker_mm
-    if not 0 < side < square_mm:
-        raise InputError(f"the marks of a ChArUco board are smaller than its squares of {square_mm:g} mm, not {side:g} mm")
+    square = float(np.mean(square_mm))  # for naming the corners only, which are measured without it
+    side = MARKER_PART * square if marker_mm is None else marker_mm
+    if not 0 < side < square:
+        raise InputError(f"the marks of a ChArUco board are smaller than its squares of {square:g} mm, not {side:g} mm")
     words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{dictionary.upper()}"))
     marks = (corners[0] + 1) * (corners[1] + 1) // 2
     if marks > len(words.bytesList):
         raise InputError(f"a board of {corners[0]}x{corners[1]} corners has {marks} marks, and {dictionary} only {len(words.bytesList)}")
-    board = cv2.aruco.CharucoBoard((corners[0] + 1, corners[1] + 1), square_mm, side, words)
+    board = cv2.aruco.CharucoBoard((corners[0] + 1, corners[1] + 1), square, side, words)
     return search_photographs(photographs, board_mm, lambda gray: _find(gray, board, board_mm), total, progress)
 
 

@@ -25,7 +25,7 @@ Progress = Callable[[int, int], None]
 # A board's corners along a side, and its size: outside these, a number is in other units or squares were counted wrongly.
 CORNERS_RANGE = (3, 200)
 SQUARE_RANGE_MM = (0.2, 1000.0)
-LARGEST_BOARD_MM = 10_000.0
+LARGEST_BOARD_MM = 5_000.0
 # The search goes from a small picture, where most boards are found at once, to larger ones (longer side, px).
 SEARCH_SIDES_PX = (800, 1600, 3200)
 THOROUGH_SIDE_PX = 1600
@@ -42,18 +42,23 @@ FEWEST_FITTED = 0.8
 LARGEST_LOST_SIDE = 0.5
 
 
-def chessboard_mm(corners: tuple[int, int], square_mm: float) -> Array:
-    """Inner corners of a printed chessboard (columns * rows, 3) in mm, z = 0, row by row. Raises InputError for odd sizes."""
+def chessboard_mm(corners: tuple[int, int], square_mm: float | tuple[float, float]) -> Array:
+    """Inner corners of a printed chessboard (columns * rows, 3) in mm, z = 0, row by row.
+
+    square_mm: side of a square, or its sides along x and y as a printer made them. Raises InputError for odd sizes.
+    """
     columns, rows = _check_corners(corners)
-    longest = (max(columns, rows) - 1) * square_mm
-    if not SQUARE_RANGE_MM[0] <= square_mm <= SQUARE_RANGE_MM[1] or longest > LARGEST_BOARD_MM:
+    sides = np.broadcast_to(np.asarray(square_mm, dtype=float), 2)
+    longest = float(((np.array([columns, rows]) - 1) * sides).max())
+    if not all(SQUARE_RANGE_MM[0] <= side <= SQUARE_RANGE_MM[1] for side in sides) or longest > LARGEST_BOARD_MM:
+        size = "x".join(f"{side:g}" for side in np.unique(sides))
         raise InputError(
-            f"squares of {square_mm:g} mm make a board of {columns}x{rows} corners {longest:g} mm long; "
+            f"squares of {size} mm make a board of {columns}x{rows} corners {longest:g} mm long; "
             f"squares of {SQUARE_RANGE_MM[0]} to {SQUARE_RANGE_MM[1]:g} mm and boards up to {LARGEST_BOARD_MM / 1000:g} m are taken: "
             "is it in millimetres?"
         )
     x, y = np.meshgrid(np.arange(columns), np.arange(rows))
-    return np.asarray(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1) * float(square_mm), dtype=float)
+    return np.asarray(np.stack([x.ravel() * sides[0], y.ravel() * sides[1], np.zeros(x.size)], axis=-1), dtype=float)
 
 
 def _check_corners(corners: tuple[int, int]) -> tuple[int, int]:
@@ -205,14 +210,24 @@ def _corner_model(p: Float32, dx: Float32, dy: Float32) -> tuple[Float32, Float3
 
 
 def find_boards(
-    photographs: Iterable[tuple[str, Gray]], corners: tuple[int, int], square_mm: float, total: int = 0, progress: Progress | None = None
+    photographs: Iterable[tuple[str, Gray]],
+    corners: tuple[int, int],
+    square_mm: float | tuple[float, float],
+    total: int = 0,
+    progress: Progress | None = None,
 ) -> BoardSearch:
     """Find a chessboard in each photograph (name, gray), given one after the other so that few are in memory at a time.
 
-    progress(done, total) is called after each. Raises InputError for an impossible board or photographs of different
-    sizes, MeasurementError when no photograph shows the board.
+    square_mm: see `chessboard_mm`. progress(done, total) is called after each. Raises InputError for an impossible board or
+    photographs of different sizes, MeasurementError when no photograph shows the board.
     """
     board = chessboard_mm(corners, square_mm)
+    sides = np.broadcast_to(np.asarray(square_mm, dtype=float), 2)
+    if corners[0] == corners[1] and sides[0] != sides[1]:
+        raise InputError(
+            f"a chessboard of {corners[0]}x{corners[1]} corners looks the same after a quarter turn, so nobody can tell along which side "
+            f"its squares are {sides[0]:g} and along which {sides[1]:g} mm; print one with more corners one way, or a ChArUco board"
+        )
     return search_photographs(photographs, board, lambda gray: find_chessboard(gray, corners), total, progress)
 
 

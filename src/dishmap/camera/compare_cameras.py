@@ -113,8 +113,11 @@ def split_views(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Board
     return list(views[::2]), list(views[1::2])
 
 
-def halves_of(calibration: Calibration) -> Halves | None:
-    """Calibrate each half of the views alone and compare; None when there are too few views or a half is no calibration."""
+def halves_of(calibration: Calibration, distance_mm: float | None = None) -> Halves | None:
+    """Calibrate each half of the views alone and compare; None when there are too few views or a half is no calibration.
+
+    distance_mm: where they are compared, by default where the boards were.
+    """
     if len(calibration.views) < 2 * FEWEST_VIEWS:
         return None
     camera = calibration.camera
@@ -126,7 +129,7 @@ def halves_of(calibration: Calibration) -> Halves | None:
     except DishmapError:
         return None
     first, second = made[0].camera, made[1].camera
-    distance = working_distance_mm(calibration)
+    distance = distance_mm or working_distance_mm(calibration)
     seen = [np.concatenate([view.pixels for view in half.views]) for half in made]
     assert first.covariance is not None
     assert second.covariance is not None

@@ -53,12 +53,19 @@ class Resampled:
 
 
 def resample(
-    calibration: Calibration, rng: np.random.Generator, samples: int = SAMPLES, progress: Progress | None = None
+    calibration: Calibration,
+    rng: np.random.Generator,
+    samples: int = SAMPLES,
+    progress: Progress | None = None,
+    distance_mm: float | None = None,
 ) -> Resampled | None:
-    """Refit `samples` times and compare the scatter of projections with the claimed one; None where the claim is of no error at all."""
+    """Refit `samples` times and compare the scatter of projections with the claimed one; None where the claim is of no error at all.
+
+    distance_mm: where shapes are to be measured, by default where the boards were.
+    """
     if calibration.sigma_px * calibration.inflation <= 0:
         return None
-    camera, distance = calibration.camera, working_distance_mm(calibration)
+    camera, distance = calibration.camera, distance_mm or working_distance_mm(calibration)
     seen = np.concatenate([view.pixels[used] for view, used in zip(calibration.views, calibration.used, strict=True)])
     covered = covered_area(picture_grid(camera.width_px, camera.height_px), seen)
     square = np.zeros(covered.shape)

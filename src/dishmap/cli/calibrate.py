@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from dishmap.cli.options import PATH, POSITIVE, F, Grid, out_file, refuse_overwriting
+from dishmap.cli.board_options import board_file, board_of, board_options
+from dishmap.cli.options import PATH, POSITIVE, out_file, refuse_overwriting
 from dishmap.cli.terminal import progress, say, table
-from dishmap.errors import InputError
+from dishmap.errors import InputError, MeasurementError
 
 if TYPE_CHECKING:
     from dishmap.calibration_report import Checks
@@ -19,54 +20,22 @@ if TYPE_CHECKING:
     from dishmap.camera.calibrate import Calibration
     from dishmap.camera.lens_choice import LensChoice
     from dishmap.io.images import Gray
+    from dishmap.sheet.boards import CornerBoard
     from dishmap.targets.pattern import Pattern
 
-# Tests hold these to `dishmap.camera.calibrate.LENSES`, `dishmap.sheet.boards.BOARDS`, `dishmap.camera.charuco.DICTIONARIES` and
-# `dishmap.io.camera_formats.SUFFIXES`, which are not loaded for the sake of a help text.
+# Tests hold these to `dishmap.camera.calibrate.LENSES` and `dishmap.io.camera_formats.SUFFIXES`, which are not loaded for a help text.
 LENSES = {"4": "opencv4", "5": "opencv5", "8": "opencv8", "12": "opencv12", "fisheye": "fisheye"}
-BOARDS = ("chessboard", "charuco", "circles", "acircles", "rings")
-DICTIONARIES = ("4x4_50", "4x4_250", "5x5_100", "5x5_1000", "6x6_250")
 FORMATS = ("ros", "mrcal", "kalibr")
 # The resampling draws the same noise every time, so that the same photographs give the same page.
 SEED = 1
-
-
-@dataclass(frozen=True)
-class Board:
-    """The board as the options describe it."""
-
-    kind: str
-    corners: tuple[int, int] | None
-    square_mm: float | None
-    radius_mm: float | None
-    marks: bool
-    marker_mm: float | None
-    dictionary: str
-
-
-def _board_options(command: F) -> F:
-    options = [
-        click.option(
-            "--board", default="chessboard", show_default=True, metavar="|".join((*BOARDS, "PATTERN.json")), help="What is photographed."
-        ),
-        click.option(
-            "--corners", type=Grid(), metavar="NxM", help="Inner corners (where four squares meet), or circles, along the two sides."
-        ),
-        click.option("--square-mm", type=POSITIVE, help="Side of a square, or pitch of circles, as printed: measure it."),
-        click.option("--radius-mm", type=POSITIVE, help="Of circles, or of rings.  [default: as `dishmap sheet board` prints them]"),
-        click.option("--no-orientation-marks", "plain", is_flag=True, help="Circles or rings that all look alike."),
-        click.option("--marker-mm", type=POSITIVE, help="Side of the marks of a ChArUco board.  [default: 0.75 of a square]"),
-        click.option("--dictionary", type=click.Choice(DICTIONARIES), default="5x5_1000", show_default=True, help="Of a ChArUco board."),
-        click.option("--flat-board", is_flag=True, help="The board is flat (glass): do not allow for a bend."),
-    ]
-    for option in reversed(options):
-        command = option(command)
-    return command
+# Of photographs left out, so many are named in an error.
+LISTED = 3
 
 
 @click.command("calibrate")
 @click.argument("photos", nargs=-1, required=True, type=PATH, metavar="PHOTOS...")
-@_board_options
+@board_options
+@click.option("--flat-board", is_flag=True, help="The board is flat (glass): do not allow for a bend.")
 @click.option(
     "--lens",
     type=click.Choice(["auto", *LENSES]),
@@ -75,57 +44,39 @@ def _board_options(command: F) -> F:
     help="Number of OpenCV's lens coefficients, or fisheye; auto takes the leanest that is as good as any on views held out.",
 )
 @click.option("--format", "formats", type=click.Choice(FORMATS), multiple=True, help="Write the camera for another program too.")
+@click.option("--working-mm", type=POSITIVE, help="How far away you will measure: errors are stated for there.  [default: at the boards]")
 @out_file("Camera file (OpenCV YAML)")
 def calibrate_command(
     photos: Sequence[Path],
     board: str,
-    corners: tuple[int, int] | None,
-    square_mm: float | None,
-    radius_mm: float | None,
-    plain: bool,
-    marker_mm: float | None,
-    dictionary: str,
     flat_board: bool,
     lens: str,
     formats: Sequence[str],
+    working_mm: float | None,
     out: Path,
+    **described: Any,
 ) -> None:
     """Calibrate a camera from 10 to 20 photographs of a flat board, tilted to all sides, with fixed focus and zoom."""
-    from dishmap.io.atomic import output_folder, write_text
-    from dishmap.io.camera_file import write_camera
+    from dishmap.io.atomic import output_folder, write_files
+    from dishmap.io.camera_file import camera_text
     from dishmap.io.camera_formats import SUFFIXES, camera_in_format
 
-    described = _checked(Board(board, corners, square_mm, radius_mm, not plain, marker_mm, dictionary))
+    what = board_of(board, **described)
     files = {form: out.with_suffix(SUFFIXES[form]) for form in formats}
     page = out.with_suffix(".html")
+    if out in (page, *files.values()):
+        raise InputError(f"--out {out} is the name of another file that is written; give one that ends in .yaml")
     for file in (out, page, *files.values()):
-        refuse_overwriting(file, list(photos))
+        refuse_overwriting(file, [*photos, *board_file(board)])
     with output_folder(out.parent):
         names = _names(photos)
-        result, choice, not_found = _calibrated(described, photos, names, lens, flat_board)
+        result, choice, not_found = _calibrated(what, photos, names, lens, flat_board)
         texts = {form: camera_in_format(result.camera, form, out.stem) for form in files}
-        checks = _checks(result, choice)
-        write_camera(out, result.camera, result)
-        for form, text in texts.items():
-            write_text(files[form], text)
-        write_text(page, _page(result, checks, photos, names, out))
+        checks = _checks(result, choice, working_mm)
+        made = {out.name: camera_text(result.camera, result), **{files[form].name: text for form, text in texts.items()}}
+        write_files(out.parent, made | {page.name: _page(result, checks, photos, names, out)})
     _report(result, checks, not_found, names, [out, *files.values()])
     say(f"report: {page}")
-
-
-def _checked(board: Board) -> Board:
-    """The board, or a usage error for options that do not go together."""
-    if board.kind not in BOARDS and not board.kind.lower().endswith(".json"):
-        raise click.UsageError(f"--board takes {', '.join(BOARDS)} or a pattern file that ends in .json, not {board.kind!r}")
-    if board.kind in BOARDS and (board.corners is None or board.square_mm is None):
-        raise click.UsageError(f"--board {board.kind} needs --corners and --square-mm")
-    if board.kind not in BOARDS and (board.corners is not None or board.square_mm is not None or board.radius_mm is not None):
-        raise click.UsageError("a pattern file says itself what is printed; leave out --corners, --square-mm and --radius-mm")
-    if board.radius_mm is not None and board.kind not in ("circles", "acircles", "rings"):
-        raise click.UsageError(f"--radius-mm means nothing to --board {board.kind}; leave it out")
-    if board.marker_mm is not None and board.kind != "charuco":
-        raise click.UsageError(f"--marker-mm means nothing to --board {board.kind}; leave it out")
-    return board
 
 
 def _names(photos: Sequence[Path]) -> list[str]:
@@ -138,29 +89,36 @@ def _names(photos: Sequence[Path]) -> list[str]:
 
 
 def _photographs(photos: Sequence[Path], names: Sequence[str]) -> Iterator[tuple[str, Gray]]:
+    """Name and pixels of each photograph. Raises InputError for one that is given twice: it would count as two views."""
     from dishmap.io.images import read_gray
 
+    known: dict[bytes, str] = {}
     for photo, name in zip(photos, names, strict=True):
-        yield name, read_gray(photo)
+        gray = read_gray(photo)
+        same = known.setdefault(hashlib.blake2b(gray.tobytes()).digest(), name)
+        if same != name:
+            raise InputError(f"{same} and {name} are the same photograph; give each once")
+        yield name, gray
 
 
 def _calibrated(
-    board: Board, photos: Sequence[Path], names: Sequence[str], lens: str, flat: bool
+    board: Pattern | CornerBoard, photos: Sequence[Path], names: Sequence[str], lens: str, flat: bool
 ) -> tuple[Calibration, LensChoice | None, dict[str, str]]:
     """The calibration, why its lens was chosen, and the photographs without a board."""
-    if board.kind not in ("chessboard", "charuco"):
-        return _from_circles(_pattern(board), photos, names, lens, flat)
     from dishmap.camera.charuco import find_charuco_boards
     from dishmap.camera.chessboard import find_boards
+    from dishmap.targets.pattern import Pattern
 
-    assert board.corners is not None
-    assert board.square_mm is not None
+    if isinstance(board, Pattern):
+        return _from_circles(board, photos, names, lens, flat)
     with progress("looking for the board") as tell:
         given = _photographs(photos, names)
-        if board.kind == "chessboard":
+        if board.dictionary is None or board.marker_mm is None:
             search = find_boards(given, board.corners, board.square_mm, len(photos), tell)
         else:
-            search = find_charuco_boards(given, board.corners, board.square_mm, board.marker_mm, board.dictionary, len(photos), tell)
+            marker_mm = sum(board.marker_mm) / 2  # the marks name the corners and are not measured
+            search = find_charuco_boards(given, board.corners, board.square_mm, marker_mm, board.dictionary, len(photos), tell)
+    _check_enough(len(search.views), search.rejected)
     return *_solved(search.views, search.width_px, search.height_px, lens, flat), search.rejected
 
 
@@ -172,11 +130,26 @@ def _from_circles(
     with progress("looking for the board") as tell:
         search = find_circle_boards(_photographs(photos, names), pattern, len(photos), tell)
     found = search.found
+    _check_enough(len(found.views), found.rejected)
     rough, _ = _solved(found.views, found.width_px, found.height_px, lens, flat)
     with progress("measuring the targets") as tell:
         views, lost = measured_views(_photographs(photos, names), pattern, search, rough, len(photos), tell)
     left_out = {**found.rejected, **rough.rejected, **lost}
+    _check_enough(len(views), left_out)
     return *_solved(views, found.width_px, found.height_px, lens, flat), left_out
+
+
+def _check_enough(count: int, left_out: dict[str, str]) -> None:
+    """Raise MeasurementError when photographs that were left out are why too few remain, with the reasons of some."""
+    from dishmap.camera.screening import FEWEST_VIEWS
+
+    if count < FEWEST_VIEWS and left_out:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:LISTED])
+        more = f"; and {len(left_out) - LISTED} more" if len(left_out) > LISTED else ""
+        raise MeasurementError(
+            f"only {count} of {count + len(left_out)} photographs show the board well enough, and at least {FEWEST_VIEWS} are needed; "
+            f"left out: {reasons}{more}"
+        )
 
 
 def _solved(views: Sequence[BoardView], width_px: int, height_px: int, lens: str, flat: bool) -> tuple[Calibration, LensChoice | None]:
@@ -189,24 +162,7 @@ def _solved(views: Sequence[BoardView], width_px: int, height_px: int, lens: str
         return choose_lens(views, width_px, height_px, flat, tell)
 
 
-def _pattern(board: Board) -> Pattern:
-    """The pattern of a board of circles."""
-    if board.kind not in BOARDS:
-        from dishmap.io.pattern_file import read_pattern
-
-        return read_pattern(board.kind)
-    from dishmap.sheet.boards import asymmetric_board, circles_board, rings_board
-
-    assert board.corners is not None
-    assert board.square_mm is not None
-    if board.kind == "acircles":
-        return asymmetric_board(board.corners, board.square_mm, board.radius_mm)
-    if board.kind == "rings":
-        return rings_board(board.corners, board.square_mm, board.radius_mm, marks=board.marks)
-    return circles_board(board.corners, board.square_mm, board.radius_mm, board.marks)
-
-
-def _checks(result: Calibration, choice: LensChoice | None) -> Checks:
+def _checks(result: Calibration, choice: LensChoice | None, working_mm: float | None) -> Checks:
     import numpy as np
 
     from dishmap.calibration_report import Checks
@@ -215,8 +171,8 @@ def _checks(result: Calibration, choice: LensChoice | None) -> Checks:
     from dishmap.camera.resample import resample
 
     with progress("checking the claims") as tell:
-        sampled = resample(result, np.random.default_rng(SEED), progress=tell)
-    return Checks(choice, halves_of(result), sampled, suggestions(result))
+        sampled = resample(result, np.random.default_rng(SEED), progress=tell, distance_mm=working_mm)
+    return Checks(choice, halves_of(result, working_mm), sampled, suggestions(result, distance_mm=working_mm))
 
 
 def _page(result: Calibration, checks: Checks, photos: Sequence[Path], names: Sequence[str], out: Path) -> str:

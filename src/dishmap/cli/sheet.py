@@ -219,10 +219,12 @@ def _make(
 
 
 def _say_printed(sheets: Sheets, measured_mm: list[float], file: Path) -> None:
+    from dishmap.targets.pattern import Pattern
+
     scale = [measured / sheets.paper.bar_mm for measured in measured_mm]
     say(f"{file}: as printed, {100 * (scale[0] - 1):+.2f} % along x and {100 * (scale[1] - 1):+.2f} % along y of the sheets")
     uneven = abs(scale[0] / scale[1] - 1)
-    if uneven >= UNEVEN:
+    if uneven >= UNEVEN and isinstance(sheets.what, Pattern):
         say(
             f"  circles are ellipses by {uneven:.2%}, which a pattern file cannot hold: places are right, but a target seen face on looks "
             "tilted; better print on a printer that is even both ways"
@@ -263,7 +265,13 @@ def _say_identity(sheets: Sheets) -> None:
     from dishmap.targets.pattern import Pattern
     from dishmap.targets.symmetry import symmetry_poses
 
-    if isinstance(sheets.what, Pattern) and (same := len(symmetry_poses(sheets.what))):
+    if not isinstance(sheets.what, Pattern):
+        if sheets.what.dictionary is None and sheets.what.corners[0] == sheets.what.corners[1]:
+            say(
+                "  the board looks the same after a quarter turn, so a printer that is uneven along x and y cannot be allowed for; "
+                "take more corners one way"
+            )
+    elif same := len(symmetry_poses(sheets.what)):
         say(
             f"  the pattern looks the same after {same} turn{'s' * (same > 1)}, so `dishmap map` needs --upright or --pose-guess; "
             "orientation marks avoid that"

@@ -96,7 +96,7 @@ def read_pattern(path: str | os.PathLike[str]) -> Pattern:
 
 def parse_pattern(text: str, source: str = "the pattern") -> Pattern:
     """Make a Pattern of the text of a pattern file; `source` stands in messages. Raises PatternError."""
-    content = _load(text, source)
+    content = load_json(text, source)
     _check_format(content, source)
     try:
         model = PatternModel.model_validate(content)
@@ -147,7 +147,8 @@ def schema_text() -> str:
     return json.dumps(pattern_schema(), indent=2) + "\n"
 
 
-def _load(text: str, source: str) -> Any:
+def load_json(text: str, source: str) -> Any:
+    """What a text of JSON holds; `source` stands in messages. Raises PatternError for what is none, or gives a key twice."""
     try:
         return json.loads(text, object_pairs_hook=_unique_keys)
     except json.JSONDecodeError as error:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.io.atomic import write_files
+from dishmap.io.board_file import LIST_FORMAT, format_board
 from dishmap.io.pattern_file import format_pattern
 from dishmap.sheet.boards import CornerBoard
 from dishmap.sheet.flatten import AlongMeridian
@@ -19,7 +20,6 @@ from dishmap.sheet.sheets import Sheets
 from dishmap.sheet.svg import svg_text
 from dishmap.targets.pattern import Pattern
 
-FORMAT, BOARD_FORMAT = "dishmap-sheets/1", "dishmap-board/1"
 PDF_NAME, LIST_NAME = "sheets.pdf", "sheets.json"
 
 
@@ -35,14 +35,7 @@ def page_name(number: int) -> str:
 
 def format_drawn(what: Pattern | CornerBoard) -> str:
     """The text of a pattern file or a board file."""
-    if isinstance(what, Pattern):
-        return format_pattern(what)
-    content: dict[str, Any] = {"format": BOARD_FORMAT, "board": what.kind, "corners": list(what.corners)}
-    content["square_mm"] = _rounded(np.array(what.square_mm))
-    if what.marker_mm is not None:
-        content |= {"marker_mm": _rounded(np.array(what.marker_mm)), "dictionary": what.dictionary}
-    content["corners_mm"] = [_rounded(corner) for corner in what.corners_mm]
-    return json.dumps(content, indent=1).replace("[\n  ", "[").replace(",\n  ", ", ").replace("\n ]", "]") + "\n"
+    return format_pattern(what) if isinstance(what, Pattern) else format_board(what)
 
 
 def write_sheets(folder: str | os.PathLike[str], sheets: Sheets) -> list[str]:
@@ -75,7 +68,7 @@ def sheets_list(sheets: Sheets) -> dict[str, Any]:
         placed.append(entry)
     paper = sheets.paper
     return {
-        "format": FORMAT,
+        "format": LIST_FORMAT,
         "drawn": drawn_name(sheets.what),
         "paper_mm": [paper.width_mm, paper.height_mm],
         "margin_mm": paper.margin_mm,
