@@ -53,5 +53,3 @@ def print_photographs(pdf: Path, camera: Camera, count: int, scale: tuple[float,
         names.append(pdf.with_name(f"photo{number}.png"))
         cv2.imwrite(str(names[-1]), np.clip(np.rint(photographed(page, camera, pose, scale, rng)), 0, 255).astype(np.uint8))
     return names
-
-

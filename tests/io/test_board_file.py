@@ -67,7 +67,7 @@ def test_what_is_no_board(tmp_path: Path, text: str, message: str) -> None:
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="cannot read the board file .*: No such file or directory"):
+    with pytest.raises(InputError, match=r"cannot read the board file .*: No such file or directory"):
         read_drawn(tmp_path / "none.json")
     (tmp_path / "bytes.json").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="is no board file: it is not text in UTF-8"):
