@@ -293,3 +293,18 @@ def test_wrong_input_is_refused_in_words() -> None:
         map_photograph(np.full(image.shape, np.nan), CAMERA, pattern, Upright())
     with pytest.raises(IdentityError):
         map_photograph(np.full_like(image, 128), CAMERA, pattern, Upright())
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_upright_follows_the_turn_that_viewers_make(quarters: int) -> None:
+    """A picture is stored turned to the left, and viewers turn it back to the right: names are those of the picture as it is shown."""
+    camera, pattern = Camera(480, 480, [600.0, 600.0], [239.5, 239.5]), plate(3, 4, 40.0)
+    pose = Pose(np.diag([1.0, -1.0, -1.0]), np.array([5.0, -3.0, 350.0]))
+    shown = simulate(Scene(pattern, camera, pose), np.random.default_rng(0)).image
+    upright = map_photograph(shown, camera, pattern, Upright()).poses
+    stored = map_photograph(np.ascontiguousarray(np.rot90(shown, quarters)), camera, pattern, Upright(90.0 * quarters)).poses
+    assert stored.ids.tolist() == upright.ids.tolist()
+    u, v = (upright.center_px - 239.5).T
+    for _ in range(quarters):
+        u, v = v, -u
+    assert stored.center_px == pytest.approx(np.column_stack([u, v]) + 239.5, abs=0.02)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from dishmap.difference.priors import Priors
     from dishmap.io.camera_file import read_camera, write_camera
     from dishmap.io.difference_file import read_difference
-    from dishmap.io.images import read_gray
+    from dishmap.io.images import read_gray, read_turn_deg
     from dishmap.io.measurement_file import read_measurement, write_measurement
     from dishmap.io.pattern_file import read_pattern, write_pattern
     from dishmap.io.sheet_file import write_sheets
@@ -88,6 +88,7 @@ _HOME = {
     "read_gray": "dishmap.io.images",
     "read_measurement": "dishmap.io.measurement_file",
     "read_pattern": "dishmap.io.pattern_file",
+    "read_turn_deg": "dishmap.io.images",
     "simulate_photograph": "dishmap.simulate.render",
     "undistort_image": "dishmap.camera.undistort",
     "undistort_points": "dishmap.camera.undistort",
@@ -138,6 +139,7 @@ __all__ = [
     "read_gray",
     "read_measurement",
     "read_pattern",
+    "read_turn_deg",
     "simulate_photograph",
     "track_targets",
     "undistort_image",

@@ -20,7 +20,7 @@ from PIL import Image, ImageOps
 
 from dishmap.errors import ImageError
 from dishmap.io.image_header import ImageHeader, read_header
-from dishmap.io.images import read_gray
+from dishmap.io.images import read_gray, read_turn_deg
 
 HEIGHT, WIDTH = 40, 60
 # grey levels; weights are rounded once by us and once by Pillow
@@ -127,15 +127,29 @@ def test_16_bit_colour(tmp_path: Path, kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF", "WEBP"])
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_exif_turns_are_made(tmp_path: Path, kind: str, orientation: int) -> None:
+def test_pixels_stay_as_the_sensor_gave_them_and_exif_turns_are_told(tmp_path: Path, kind: str, orientation: int) -> None:
     exif = Image.Exif()
     exif[EXIF_ORIENTATION] = orientation
     options = {"lossless": True} if kind == "WEBP" else {"quality": 100} if kind == "JPEG" else {}
-    data = encoded(Image.fromarray(RGB), kind, exif=exif, **options)
-    expected = np.asarray(ImageOps.exif_transpose(Image.open(io.BytesIO(data))).convert("L")).astype(int)
-    gray = read_gray(saved(tmp_path, data))
+    path = saved(tmp_path, encoded(Image.fromarray(RGB), kind, exif=exif, **options))
+    expected = np.asarray(Image.fromarray(RGB).convert("L")).astype(int)
+    gray = read_gray(path)
     assert gray.shape == expected.shape
     assert np.abs(gray - expected).max() <= SAME_JPEG
+    # what viewers show, turned as told, but for those that are mirrored
+    if orientation in (1, 3, 6, 8):
+        shown = np.asarray(ImageOps.exif_transpose(Image.open(path)).convert("L")).astype(int)
+        assert np.abs(np.rot90(gray, -(read_turn_deg(path) // 90)) - shown).max() <= SAME_JPEG
+    else:
+        assert read_turn_deg(path) == 0
+
+
+def test_damaged_exif_is_passed_over(tmp_path: Path) -> None:
+    jpeg = encoded(Image.fromarray(RGB), "JPEG")
+    for junk in (b"Exif\0\0", b"Exif\0\0II*\0\xff\xff\xff\xff", b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\xff\xff\0\0\0\0"):
+        path = saved(tmp_path, jpeg[:2] + b"\xff\xe1" + struct.pack(">H", 2 + len(junk)) + junk + jpeg[2:])
+        assert read_turn_deg(path) == 0
+        assert read_gray(path).shape == (HEIGHT, WIDTH)
 
 
 @pytest.mark.parametrize("name", ["ein Bild.png", "Größe 照片.png"])

@@ -76,5 +76,5 @@ def check_size(camera: Camera, image: NDArray[np.generic]) -> None:
         return
     hint = "use the camera file that was made with photographs of this size"
     if (height, width) == (camera.width_px, camera.height_px):
-        hint = "one of them is turned by a quarter; calibrate with photographs turned the same way"
+        hint = "one of them is turned by a quarter; use pixels as the camera stored them (a turn that EXIF asks for is not made)"
     raise CameraError(f"the photograph has {width}x{height} px but the camera {camera.width_px}x{camera.height_px}: {hint}")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dishmap.cli.difference_outcome import REPORT, brief, outcome_files, print_difference
-from dishmap.cli.options import PATH, camera_option, hint_of, hint_options, out_folder
+from dishmap.cli.options import PATH, camera_option, hint_for, hint_of, hint_options, out_folder
 from dishmap.cli.prior_options import prior_options, priors_of
 from dishmap.cli.terminal import progress, say
 from dishmap.errors import DishmapError, InputError, MeasurementError
@@ -241,7 +241,7 @@ def measure(setup: Setup, path: Path, hint: Hint, bar: Bar) -> State:
     tell = bar.step()
     image = read_gray(path)
     with naming(path):
-        return measure_state(image, setup.camera, setup.pattern, hint, with_centers=setup.method != "joint", progress=tell)
+        return measure_state(image, setup.camera, setup.pattern, hint_for(hint, path), with_centers=setup.method != "joint", progress=tell)
 
 
 def compare(setup: Setup, reference: Reference, job: Job, bar: Bar) -> tuple[Difference, dict[str, float]]:

@@ -14,6 +14,7 @@ from dishmap.cli.options import (
     assumption_options,
     assumptions_of,
     camera_option,
+    hint_for,
     hint_of,
     hint_options,
     out_folder,
@@ -68,7 +69,7 @@ def map_command(
     inputs = {"photograph": photo, "camera": camera_file, "pattern": pattern_file, "pose_guess": pose_guess, "spacecraft": spacecraft}
     with output_folder(out):
         begin = time.perf_counter()
-        image = read_gray(photo)
+        image, hint = read_gray(photo), hint_for(hint, photo)
         read = time.perf_counter()
         with progress("measuring") as tell:
             result = map_photograph(image, camera, pattern, hint, method, basis, assumptions, tell)

@@ -108,6 +108,14 @@ def hint_of(pose_guess: Path | None, upright: bool) -> Hint:
     return Upright() if upright else None
 
 
+def hint_for(hint: Hint, photo: Path) -> Hint:
+    """The hint for the pixels of a photograph: what is upright as viewers show it, after the turn of its EXIF, may lie in them."""
+    from dishmap.io.images import read_turn_deg
+    from dishmap.targets.identify import Upright
+
+    return Upright(read_turn_deg(photo)) if isinstance(hint, Upright) else hint
+
+
 def assumption_options(command: F) -> F:
     """What is assumed of print and camera, as sigmas."""
     spread = "How far printed edges may lie outwards: sigma, in percent of the largest radius of a target.  [default: 2]"

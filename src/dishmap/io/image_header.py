@@ -16,9 +16,15 @@ from dishmap.errors import ImageError
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 # JPEG markers that start a frame: all C0..CF but those of tables (DHT, JPG, DAC)
 JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+JPEG_EXIF = 0xE1
 JPEG_BARE = frozenset((*range(0xD0, 0xD8), 0x01))
-TIFF_WIDTH, TIFF_HEIGHT, TIFF_OFFSETS, TIFF_COUNTS, TIFF_DNG = 256, 257, (273, 324), (279, 325), 50706
-TIFF_TAGS = frozenset((TIFF_WIDTH, TIFF_HEIGHT, *TIFF_OFFSETS, *TIFF_COUNTS, TIFF_DNG))
+TIFF_WIDTH, TIFF_HEIGHT, TIFF_OFFSETS, TIFF_COUNTS, TIFF_TURN, TIFF_DNG = 256, 257, (273, 324), (279, 325), 274, 50706
+TIFF_TAGS = frozenset((TIFF_WIDTH, TIFF_HEIGHT, *TIFF_OFFSETS, *TIFF_COUNTS, TIFF_TURN, TIFF_DNG))
+# EXIF in JPEG, PNG and WebP is a small TIFF; in JPEG and some WebP files this stands before it
+LARGEST_EXIF = 65536
+EXIF_START = b"Exif\0\0"
+# clockwise turn that EXIF's orientation asks of viewers, degrees; the others are mirror images, which no sensor gives
+TURNS_DEG = {3: 180, 6: 90, 8: 270}
 # bytes of a TIFF value by its type; the first three unsigned integers are all that these tags use
 TIFF_SIZES = {1: 1, 3: 2, 4: 4}
 TIFF_CODES = {1: "B", 3: "H", 4: "I"}
@@ -33,6 +39,7 @@ class ImageHeader:
     """Format and size of a picture as stored, before a turn by EXIF.
 
     coloured: it may hold more than grey. missing: what is not there of a file that is cut short, empty when whole.
+    orientation: as EXIF has it, 1 to 8; 1 where nothing is said.
     """
 
     kind: str
@@ -40,6 +47,12 @@ class ImageHeader:
     height_px: int
     coloured: bool = True
     missing: str = ""
+    orientation: int = 1
+
+    @property
+    def turn_deg(self) -> int:
+        """How far viewers turn the picture clockwise to show it: 0, 90, 180 or 270 degrees."""
+        return TURNS_DEG.get(self.orientation, 0)
 
 
 def read_header(data: bytes) -> ImageHeader:
@@ -60,19 +73,21 @@ def _png(data: bytes) -> ImageHeader:
     width, height, _, colour = struct.unpack_from(">IIBB", data, 16)
     if data[12:16] != b"IHDR":
         raise ValueError("no IHDR")
-    position, missing = len(PNG_SIGNATURE), ""
+    position, missing, orientation = len(PNG_SIGNATURE), "", 1
     for _ in range(MOST_PARTS):
         if position + 12 > len(data):
             missing = "the end chunk of the PNG"
         if missing or data[position + 4 : position + 8] == b"IEND":
             break
+        if data[position + 4 : position + 8] == b"eXIf":
+            orientation = _orientation(data[position + 8 :])
         position += 12 + struct.unpack_from(">I", data, position)[0]
-    return ImageHeader("PNG", width, height, colour not in (0, 4), missing)
+    return ImageHeader("PNG", width, height, colour not in (0, 4), missing, orientation)
 
 
 def _jpeg(data: bytes) -> ImageHeader:
     header: ImageHeader | None = None
-    position, marker = 2, 0
+    position, marker, orientation = 2, 0, 1
     for _ in range(MOST_PARTS):
         if marker == 0xDA or (header and position + 4 > len(data)):
             break
@@ -85,12 +100,14 @@ def _jpeg(data: bytes) -> ImageHeader:
         if marker in JPEG_FRAMES and header is None:
             height, width, components = struct.unpack_from(">HHB", data, position + 5)
             header = ImageHeader("JPEG", width, height, components > 1)
+        if marker == JPEG_EXIF and data[position + 4 :].startswith(EXIF_START):
+            orientation = _orientation(data[position + 4 :])
         position += 2 + struct.unpack_from(">H", data, position + 2)[0]
     if header is None:
         raise ValueError("no frame before the scan")
     # inside a scan FF is always followed by 00 or a restart, so this finds no end that is none
     whole = data.find(b"\xff\xd9", position) >= 0
-    return header if whole else replace(header, missing="the end marker of the JPEG")
+    return replace(header, missing="" if whole else "the end marker of the JPEG", orientation=orientation)
 
 
 def _tiff(data: bytes) -> ImageHeader:
@@ -105,7 +122,16 @@ def _tiff(data: bytes) -> ImageHeader:
         ends = (a + b for a, b in zip(tags.get(offsets, ()), tags.get(lengths, ()), strict=False))
         if max(ends, default=0) > len(data):
             missing = "strips of the TIFF"
-    return ImageHeader("TIFF", tags[TIFF_WIDTH][0], tags[TIFF_HEIGHT][0], missing=missing)
+    return ImageHeader("TIFF", tags[TIFF_WIDTH][0], tags[TIFF_HEIGHT][0], missing=missing, orientation=tags.get(TIFF_TURN, (1,))[0])
+
+
+def _orientation(data: bytes) -> int:
+    """The orientation in EXIF data at the start of these bytes; 1 where it has none or is damaged, as the picture itself may be whole."""
+    exif = data.removeprefix(EXIF_START)[:LARGEST_EXIF]
+    try:
+        return _tiff_tags(exif, "<" if exif.startswith(b"II") else ">").get(TIFF_TURN, (1,))[0]
+    except (struct.error, IndexError, ValueError):
+        return 1
 
 
 def _tiff_tags(data: bytes, order: str) -> dict[int, tuple[int, ...]]:
@@ -153,7 +179,20 @@ def _webp(data: bytes) -> ImageHeader:
         width, height = (value & 0x3FFF for value in struct.unpack_from("<HH", data, 26))
     else:
         raise ValueError("unknown WebP")
-    return ImageHeader("WebP", width, height, missing="" if size + 8 <= len(data) else "the end of the WebP")
+    missing = "" if size + 8 <= len(data) else "the end of the WebP"
+    return ImageHeader("WebP", width, height, missing=missing, orientation=_webp_orientation(data))
+
+
+def _webp_orientation(data: bytes) -> int:
+    position = 12
+    for _ in range(MOST_PARTS):
+        if position + 8 > len(data):
+            break
+        if data[position : position + 4] == b"EXIF":
+            return _orientation(data[position + 8 :])
+        (length,) = struct.unpack_from("<I", data, position + 4)
+        position += 8 + length + length % 2
+    return 1
 
 
 def _pnm(data: bytes) -> ImageHeader:

@@ -2,13 +2,14 @@
 
 A photograph may be PNG, JPEG, TIFF, BMP, WebP or binary PGM or PPM, with 8 or 16 bits, grey, coloured, with alpha or turned
 by EXIF. Colour becomes grey as 0.299 R + 0.587 G + 0.114 B of the stored values (ITU-R BT.601, as OpenCV); alpha is left
-out of account; the turn that EXIF asks for is made, as photo viewers do.
+out of account. Pixels stay as the sensor gave them: a lens and its principal point are those of the sensor, whichever way a phone
+thought it was held, so the turn that EXIF asks of viewers is not made (`read_turn_deg` tells it).
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -25,6 +26,16 @@ Gray = NDArray[np.uint8] | NDArray[np.uint16]
 LARGEST_PX = 200_000_000
 SMALLEST_SIDE_PX = 16
 LARGEST_FILE_BYTES = 2_000_000_000
+# What takes the pixels that EXIF's orientation made back to how they are stored.
+UNDO: dict[int, Callable[[Gray], Gray]] = {
+    2: lambda gray: gray[:, ::-1],
+    3: lambda gray: gray[::-1, ::-1],
+    4: lambda gray: gray[::-1],
+    5: lambda gray: gray.T,
+    6: lambda gray: gray.T[::-1],
+    7: lambda gray: gray.T[::-1, ::-1],
+    8: lambda gray: gray.T[:, ::-1],
+}
 
 
 def read_gray(path: str | Path) -> Gray:
@@ -38,6 +49,14 @@ def read_gray(path: str | Path) -> Gray:
         header = read_header(data)
         _check(header)
         return _decode(data, header)
+    except ImageError as error:
+        raise ImageError(f"cannot use {path} as a photograph: {error}") from error
+
+
+def read_turn_deg(path: str | Path) -> int:
+    """How far viewers turn a photograph clockwise, as its EXIF asks: 0, 90, 180 or 270 degrees. Raises ImageError as `read_gray` does."""
+    try:
+        return read_header(_read(Path(path))).turn_deg
     except ImageError as error:
         raise ImageError(f"cannot use {path} as a photograph: {error}") from error
 
@@ -77,7 +96,7 @@ def _decode(data: bytes, header: ImageHeader) -> Gray:
     mode = cv2.IMREAD_COLOR if mixed_here else cv2.IMREAD_GRAYSCALE
     try:
         with _quiet():
-            image = cv2.imdecode(buffer, mode | cv2.IMREAD_ANYDEPTH)
+            image = cv2.imdecode(buffer, mode | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
         raise ImageError(f"the {header.kind} cannot be decoded ({error.err}); save it again as PNG") from error
     if image is None:
@@ -85,6 +104,8 @@ def _decode(data: bytes, header: ImageHeader) -> Gray:
     if image.dtype not in (np.uint8, np.uint16):
         raise ImageError(f"its pixels are {image.dtype}; 8 or 16-bit whole numbers are needed, so convert it")
     gray: Gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if mixed_here else image  # type: ignore[assignment]
+    if header.kind == "TIFF" and header.orientation in UNDO:  # OpenCV turns a TIFF whatever it is asked
+        gray = UNDO[header.orientation](gray).copy()
     return gray
 
 

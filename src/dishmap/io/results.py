@@ -242,7 +242,7 @@ def hint_content(hint: Hint) -> dict[str, Any]:
         return {"kind": "none"}
     if isinstance(hint, PoseGuess):
         return {"kind": "pose_guess", "camera_from_dish": pose_content(hint.camera_from_dish)}
-    return {"kind": "upright"}
+    return {"kind": "upright", "turn_deg": hint.turn_deg} if hint.turn_deg else {"kind": "upright"}
 
 
 def camera_content(camera: Camera) -> dict[str, Any]:

@@ -72,7 +72,16 @@ MOST_COPIES = 4
 
 @dataclass(frozen=True)
 class Upright:
-    """Hint: the camera looks along the pattern's -z with the pattern's y up in the image, turned by less than 45 degrees."""
+    """Hint: the camera looks along the pattern's -z with the pattern's y up in the image, turned by less than 45 degrees.
+
+    turn_deg: how far clockwise the image is turned before it is looked at, as EXIF may ask (`read_turn_deg`).
+    """
+
+    turn_deg: float = 0.0
+
+    def off_rad(self, roll_rad: NDArray[np.float64] | float) -> NDArray[np.float64]:
+        """How far rolls (see `roll_rad`) of any shape are from this."""
+        return np.asarray(np.abs((roll_rad - np.radians(self.turn_deg) + np.pi) % (2 * np.pi) - np.pi))
 
 
 @dataclass(frozen=True)
@@ -299,7 +308,7 @@ def _chosen(options: list[_Option], hint: Hint, pattern: Pattern, copies: int) -
 
 def _agrees(pose: Pose, hint: Hint) -> bool:
     if isinstance(hint, Upright):
-        return abs(roll_rad(pose)) < UPRIGHT_RAD
+        return bool(hint.off_rad(roll_rad(pose)) < UPRIGHT_RAD)
     if isinstance(hint, PoseGuess):
         turn, shift = _difference(pose, hint.camera_from_dish)
         return turn < GUESS_TURN_RAD and shift < GUESS_SHIFT_MM
@@ -312,7 +321,7 @@ def _about_agree(pose: Pose, hint: Hint, rotation: Array, shift: Array) -> NDArr
     if isinstance(hint, Upright):
         relative = UPSIDE @ turned
         roll = np.arctan2(relative[:, 1, 0] - relative[:, 0, 1], relative[:, 0, 0] + relative[:, 1, 1])
-        return np.asarray(np.abs(roll) < ROOM * UPRIGHT_RAD)
+        return hint.off_rad(roll) < ROOM * UPRIGHT_RAD
     if isinstance(hint, PoseGuess):
         moved = pose.translation_mm - (turned @ shift[:, :, None])[..., 0]
         cosine = (np.einsum("hij,ij->h", turned, hint.camera_from_dish.rotation) - 1) / 2
