@@ -65,6 +65,35 @@ def test_doubts_are_said() -> None:
     assert "x.jpg was left out: it is blurred." in said
 
 
+def test_what_the_camera_says_of_the_print_is_said() -> None:
+    calibration, checks = made()
+    assert not any("fx and fy" in said or "would be" in said for said in remarks_on(calibration, checks))
+    # a printer that makes squares 1.5 % taller, and the file as designed
+    rng = np.random.default_rng(2)
+    views = [replace(view, board_mm=view.board_mm / [1, 1.015, 1]) for view in corner_views(rng, CAMERA, 12)]
+    said = " ".join(remarks_on(calibrate(views, 960, 720), Checks()))
+    assert re.search(r"fx and fy differ by [01]\.\d%, and .* are the squares of the board\? Measure its scale along x and along y", said)
+
+
+@pytest.mark.parametrize(("unit", "size"), [(1 / 25.4, "7.87x5.51"), (0.1, "20x14"), (25.4, "5080x3556")])
+def test_sizes_in_other_units_are_noticed(unit: float, size: str) -> None:
+    """A board of 200x140 mm given in inches or centimetres as if they were mm, or in mm times 25.4."""
+    calibration, _ = made()
+    views = [replace(view, board_mm=view.board_mm * unit) for view in calibration.views]
+    said = " ".join(remarks_on(calibrate(views, 960, 720), Checks()))
+    assert f"The board would be {size} mm" in said
+    assert "its size was not given in millimetres" in said
+
+
+def test_photographs_without_a_board_are_named_on_the_page() -> None:
+    calibration, _ = made()
+    checks = Checks(not_found={"blank.png": "the photograph is blank"})
+    html = calibration_report(calibration, "camera", checks)
+    assert "blank.png was left out: the photograph is blank." in html
+    assert "12 of 13" in html
+    assert "200x140 mm" in html
+
+
 def test_a_bent_board_and_lost_corners_are_said() -> None:
     calibration, checks = made()
     bent = replace(calibration.board, bend_mm=np.array([1.0, 0.0, 0.0]), covariance_mm2=np.eye(3) * 1e-4)

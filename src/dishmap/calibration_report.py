@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,16 +27,24 @@ LISTED = 4
 DOUBTFUL_RATIO, DOUBTFUL_SIGMAS = 1.15, 3.0
 # A board bent by more than this part of its side is worth a word, if the bend is known to be one (sigmas).
 BENT_PART, BENT_SIGMAS = 5e-4, 3.0
+# Pixels are square to better than this part; beyond it, and so many sigmas, the print is in doubt.
+UNEVEN_PART, UNEVEN_SIGMAS = 0.004, 3.0
+# Boards and distances outside of these are rather of other units: inches, centimetres, metres.
+LIKELY_BOARD_MM, LIKELY_DISTANCE_MM = (25.0, 3000.0), (50.0, 10_000.0)
 
 
 @dataclass(frozen=True)
 class Checks:
-    """What was found out about a calibration besides itself; None or empty for what could not be."""
+    """What was found out about a calibration besides itself; None or empty for what could not be.
+
+    not_found: name of each photograph in which the board was not found or measured, and why.
+    """
 
     choice: LensChoice | None = None
     halves: Halves | None = None
     resampled: Resampled | None = None
     suggestions: tuple[Suggestion, ...] = ()
+    not_found: dict[str, str] = field(default_factory=dict)
 
 
 def calibration_report(
@@ -69,14 +77,18 @@ def headline(calibration: Calibration, checks: Checks) -> str:
     text = f"{fit}; corners cover {calibration.coverage:.0%} of the picture."
     if checks.resampled is not None:
         known = checks.resampled
-        text += f" Shapes at {known.distance_mm:.0f} mm are projected to {number(known.covered_rms_px)} px where corners were seen."
+        across = known.covered_rms_px * known.distance_mm / float(calibration.camera.focal_px.mean())
+        text += (
+            f" Shapes at {known.distance_mm:.0f} mm are projected to {number(known.covered_rms_px)} px ({number(across)} mm there) where "
+            "corners were seen."
+        )
     return text
 
 
 def remarks_on(calibration: Calibration, checks: Checks) -> list[str]:
     """What a user should know before trusting the camera, in sentences."""
-    remarks = [f"{note[:1].upper()}{note[1:]}." for note in calibration.notes]
-    remarks += [f"{name} was left out: {reason}." for name, reason in calibration.rejected.items()]
+    remarks = [*_print_remarks(calibration), *(f"{note[:1].upper()}{note[1:]}." for note in calibration.notes)]
+    remarks += [f"{name} was left out: {reason}." for name, reason in (checks.not_found | calibration.rejected).items()]
     for name, corners in calibration.outliers.items():
         more = f" and {len(corners) - LISTED} more" if len(corners) > LISTED else ""
         remarks.append(f"{name}: {len(corners)} corner{'s' * (len(corners) > 1)} left out: {'; '.join(corners[:LISTED])}{more}.")
@@ -88,6 +100,53 @@ def remarks_on(calibration: Calibration, checks: Checks) -> list[str]:
     if board.free and (np.abs(board.bend_mm) > BENT_SIGMAS * board.sigma_mm).any() and board.sag_mm > BENT_PART * 2 * board.half_mm:
         remarks.append(f"The board is not flat, by {number(board.sag_mm)} mm from its lowest to its highest point; this was allowed for.")
     return remarks
+
+
+def _print_remarks(calibration: Calibration) -> list[str]:
+    """What the camera says of the board's print: squares that are none, sizes in other units."""
+    camera, remarks = calibration.camera, []
+    fx, fy = camera.focal_px
+    if camera.covariance is not None:
+        slope = np.array([1 / fx, -1 / fy])
+        sigma = float(np.sqrt(slope @ camera.covariance[:2, :2] @ slope))
+        apart = float(np.log(fx / fy))
+        if abs(apart) > max(UNEVEN_PART, UNEVEN_SIGMAS * sigma):
+            remarks.append(
+                f"fx and fy differ by {abs(apart):.1%}, and the pixels of nearly all sensors are square: are the squares of the board? "
+                "Measure its scale along x and along y, and give the file that `dishmap sheet ... --measured-mm XxY` writes."
+            )
+    long, short = board_size_mm(calibration)
+    near, far = board_distances_mm(calibration)
+    if not (LIKELY_BOARD_MM[0] <= long <= LIKELY_BOARD_MM[1] and LIKELY_DISTANCE_MM[0] <= near and far <= LIKELY_DISTANCE_MM[1]):
+        remarks.append(
+            f"The board would be {_mm(long)}x{_mm(short)} mm, {_mm(near)} to {_mm(far)} mm from the camera; if it was not, its size was "
+            "not given in millimetres."
+        )
+    return remarks
+
+
+def board_words(calibration: Calibration) -> str:
+    """How large the board is and where it stood: a size in other units shows here."""
+    long, short = board_size_mm(calibration)
+    near, far = board_distances_mm(calibration)
+    return f"the board measures {_mm(long)}x{_mm(short)} mm over its corners and stood {_mm(near)} to {_mm(far)} mm from the camera"
+
+
+def _mm(length: float) -> str:
+    return f"{length:.0f}" if length >= 100 else f"{length:.3g}"
+
+
+def board_size_mm(calibration: Calibration) -> tuple[float, float]:
+    """Longer and shorter side of what was seen of the board."""
+    sides = np.ptp(np.concatenate([view.board_mm[:, :2] for view in calibration.views]), axis=0)
+    return float(sides.max()), float(sides.min())
+
+
+def board_distances_mm(calibration: Calibration) -> tuple[float, float]:
+    """How near and how far along the camera's axis the board's middle was."""
+    middle = np.append(calibration.board.middle_mm, 0.0)
+    distances = [float(pose.apply(middle)[2]) for pose in calibration.poses]
+    return min(distances), max(distances)
 
 
 def _doubts(checks: Checks) -> list[str]:
@@ -105,11 +164,15 @@ def _doubts(checks: Checks) -> list[str]:
 
 def _facts(calibration: Calibration, checks: Checks) -> list[tuple[str, str, str]]:
     views, used = calibration.views, np.concatenate(calibration.used)
+    left_out = len(checks.not_found | calibration.rejected)
+    long, short = board_size_mm(calibration)
+    near, far = board_distances_mm(calibration)
     facts = [
-        ("Views used", f"{len(views)} of {len(views) + len(calibration.rejected)}", f"{int(used.sum())} of {len(used)} corners"),
+        ("Views used", f"{len(views)} of {len(views) + left_out}", f"{int(used.sum())} of {len(used)} corners"),
         ("Rms residual", f"{number(calibration.rms_px)} px", f"length; {number(calibration.rms_px / np.sqrt(2))} px per coordinate"),
         ("Noise of a coordinate", f"{number(calibration.sigma_px)} px", f"sigmas enlarged {number(calibration.inflation)} times"),
         ("Coverage", f"{calibration.coverage:.0%}", "of the picture held corners"),
+        ("Board", f"{_mm(long)}x{_mm(short)} mm", f"seen {_mm(near)} to {_mm(far)} mm away"),
     ]
     if checks.halves is not None:
         detail = f"rms where both saw corners; largest {number(checks.halves.difference.covered_max_px)} px"
@@ -150,7 +213,7 @@ def _shapes(calibration: Calibration, checks: Checks) -> str:
     if (halves := checks.halves) is not None:
         difference = halves.difference
         apart = " and ".join(number(float(value)) for value in np.abs(halves.focal_sigmas))
-        picture = field_maps(difference.pixels, [("", difference.length_px)], difference.covered, "difference (px)")
+        picture = field_maps(difference.pixels, [("two halves of the views", difference.length_px)], difference.covered, "difference (px)")
         parts.append(
             figure(
                 picture,

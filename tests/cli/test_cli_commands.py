@@ -210,7 +210,7 @@ def test_calibrate_writes_a_camera_and_says_how_good_it_is(tmp_path: Path) -> No
     words = ["calibrate", *photos, blank, "--board", "chessboard", "--corners", "9x7", "--square-mm", 10, "--lens", "4", "--out", out]
     done = dishmap(*words)
     assert done.exit_code == 0, done.stderr
-    assert "left out: blank.png: " in done.stdout
+    assert "blank.png was left out: the photograph is blank; it needs to show the board." in done.stdout
     assert "8 of 9 photographs used" in done.stdout
     assert len(re.findall(r"view\d.png +63/63 +0\.\d+", done.stdout)) == 8
     camera = read_camera(out)

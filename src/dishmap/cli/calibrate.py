@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -72,10 +73,10 @@ def calibrate_command(
         names = _names(photos)
         result, choice, not_found = _calibrated(what, photos, names, lens, flat_board)
         texts = {form: camera_in_format(result.camera, form, out.stem) for form in files}
-        checks = _checks(result, choice, working_mm)
+        checks = replace(_checks(result, choice, working_mm), not_found=not_found)
         made = {out.name: camera_text(result.camera, result), **{files[form].name: text for form, text in texts.items()}}
         write_files(out.parent, made | {page.name: _page(result, checks, photos, names, out)})
-    _report(result, checks, not_found, names, [out, *files.values()])
+    _report(result, checks, names, [out, *files.values()])
     say(f"report: {page}")
 
 
@@ -188,10 +189,10 @@ def _page(result: Calibration, checks: Checks, photos: Sequence[Path], names: Se
     return calibration_report(result, f"Calibration of {out.name}", checks, image, inputs)
 
 
-def _report(result: Calibration, checks: Checks, not_found: dict[str, str], names: Sequence[str], files: Sequence[Path]) -> None:
+def _report(result: Calibration, checks: Checks, names: Sequence[str], files: Sequence[Path]) -> None:
     import numpy as np
 
-    from dishmap.calibration_report import headline, remarks_on
+    from dishmap.calibration_report import board_words, headline, remarks_on
     from dishmap.transforms import angle_between_rad
 
     camera = result.camera
@@ -203,12 +204,9 @@ def _report(result: Calibration, checks: Checks, not_found: dict[str, str], name
         tilt = float(np.degrees(angle_between_rad(pose.rotation[:, 2], np.array([0.0, 0.0, 1.0]))))
         rows.append([view.name, f"{inlier.sum()}/{len(inlier)}", f"{rms:.3f}", f"{largest:.2f}", f"{min(tilt, 180 - tilt):.0f}"])
     say(table(["photograph", "corners", "rms px", "largest px", "tilt deg"], rows))
-    rejected = {**not_found, **result.rejected}
-    for name in names:
-        if name in rejected:
-            say(f"  left out: {name}: {rejected[name]}")
     taken = f"{len(result.views)} of {len(names)} photographs used"
     say(f"{taken}, rms {result.rms_px:.3f} px, corners cover {result.coverage:.0%} of the picture")
+    say(board_words(result))
     say(headline(result, checks))
     if checks.choice is not None:
         say(f"lens: {checks.choice.reason}")

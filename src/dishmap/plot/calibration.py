@@ -57,11 +57,8 @@ def coverage_map(pixels: Array, residual_px: Array, used: NDArray[np.bool_], wid
         axes.scatter(pixels[~used, 0], pixels[~used, 1], marker="x", s=26, c=ORANGE, label="left out")
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderpad=0.0)
     figure.colorbar(dots, ax=axes, label="residual (px)", extend="max")
-    axes.set(xlim=(-0.5, width_px - 0.5), ylim=(height_px - 0.5, -0.5), xlabel="u (px)", ylabel="v (px)")
-    axes.set_aspect("equal", adjustable="box")
-    axes.spines[["top", "right"]].set_visible(True)
-    axes.tick_params(color=FAINT, labelcolor=INK)
-    return figure
+    axes.set_title("corners seen in all views", fontsize=10, loc="right")
+    return _framed(figure, axes, width_px, height_px)
 
 
 @as_svg
@@ -133,6 +130,7 @@ def distortion_map(camera: Camera) -> Figure:
         ring = _straight_circle(camera, reach)
         axes.plot(ring[:, 0], ring[:, 1], color="white", linewidth=0.9)
     axes.plot(*camera.principal_px, marker="+", color=ORANGE, markersize=12)
+    axes.set_title("distortion of the lens", fontsize=10)
     return _framed(figure, axes, camera.width_px, camera.height_px)
 
 
