@@ -41,6 +41,9 @@ ORDER = [
     *("targets.solve", "targets.edges", "targets.light", "targets.pixels", "targets.window", "targets.neighbours"),
     *("targets.adjust", "targets.start", "targets.sensitivity", "targets.scene_noise", "targets.glare", "targets.stages"),
     *("targets.settle", "targets.pose", "targets.track"),
+    # and the nodes of grids
+    *("targets.grid_map", "targets.grid_shapes", "targets.grid_pixels", "targets.grid_fit", "targets.grid_arms", "targets.grid_stages"),
+    *("targets.grid_outcome", "targets.grid_points"),
     # boards of circles
     *("camera.board_labels", "camera.circle_board"),
     # measuring it as the paper does, and the limit of both

@@ -32,30 +32,31 @@ SMALLEST_SLOPE = 1e-20
 MOTION_DEGREE = 2
 
 
-def _powers(degree: int) -> list[tuple[int, int]]:
+def powers(degree: int) -> list[tuple[int, int]]:
+    """Exponents of two variables up to `degree`, in the order of `monomials`."""
     return [(total - j, j) for total in range(degree + 1) for j in range(total + 1)]
 
 
-MOTION_TERMS = len(_powers(MOTION_DEGREE))
+MOTION_TERMS = len(powers(MOTION_DEGREE))
 
 
-def _derivative_matrix(axis: int, degree: int) -> Array:
+def derivative_matrix(axis: int, degree: int) -> Array:
     """D with (c @ D) the coefficients of the derivative of the polynomial with coefficients c."""
-    powers = _powers(degree)
-    out = np.zeros((len(powers), len(powers)))
-    for row, power in enumerate(powers):
+    order = powers(degree)
+    out = np.zeros((len(order), len(order)))
+    for row, power in enumerate(order):
         if power[axis]:
             lower = (power[0] - 1, power[1]) if axis == 0 else (power[0], power[1] - 1)
-            out[row, powers.index(lower)] = power[axis]
+            out[row, order.index(lower)] = power[axis]
     return out
 
 
-DERIVATIVES = {degree: (_derivative_matrix(0, degree), _derivative_matrix(1, degree)) for degree in PLANE_DEGREES}
+DERIVATIVES = {degree: (derivative_matrix(0, degree), derivative_matrix(1, degree)) for degree in PLANE_DEGREES}
 
 
 def monomials(s: NDArray[Any], t: NDArray[Any], degree: int) -> NDArray[Any]:
     """Monomials (..., K, n) of s, t (..., n) up to `degree`, in the order of their total degree."""
-    out = np.empty((*s.shape[:-1], len(_powers(degree)), s.shape[-1]), dtype=s.dtype)
+    out = np.empty((*s.shape[:-1], len(powers(degree)), s.shape[-1]), dtype=s.dtype)
     out[..., 0, :] = 1
     start = 1
     for total in range(1, degree + 1):
@@ -190,7 +191,7 @@ def _plane_maps(camera: Camera, poses: Poses, curvature: Array, patches: Patches
     basis = _basis(camera.project(poses.in_camera(bent_print_mm(nodes, curvature))), patches, degree)
     lost = ~np.isfinite(basis).all(axis=(1, 2))
     basis[lost] = 0.0
-    plane = _least_squares(basis, np.swapaxes(nodes, 1, 2))
+    plane = least_squares(basis, np.swapaxes(nodes, 1, 2))
     error = np.linalg.norm(plane @ basis - np.swapaxes(nodes, 1, 2), axis=1).max(axis=1)
     misfit = np.where(lost, np.inf, error * patches.scale_px / patches.reach_mm)
     by_u, by_v = (d / patches.scale_px[:, None, None] for d in DERIVATIVES[degree])
@@ -205,10 +206,10 @@ def _motion_maps(camera: Camera, poses: Poses, curvature: Array, patches: Patche
     basis = _basis(pixels, patches, MOTION_DEGREE)
     basis[~np.isfinite(basis).all(axis=(1, 2))] = 0.0
     values = np.nan_to_num(motion).reshape(len(poses), -1, 12)
-    return _least_squares(basis, np.swapaxes(values, 1, 2)).reshape(len(poses), 2, 6, MOTION_TERMS)
+    return least_squares(basis, np.swapaxes(values, 1, 2)).reshape(len(poses), 2, 6, MOTION_TERMS)
 
 
-def _least_squares(basis: Array, values: Array) -> Array:
+def least_squares(basis: Array, values: Array) -> Array:
     """Batched least squares (M, K, Q), (M, V, Q) -> (M, V, K); the monomials' condition is mild on [-1, 1]."""
     normal = basis @ np.swapaxes(basis, 1, 2)
     # relative to each normal's size: a patch far off the image has large monomials, and must not make a singular matrix
@@ -222,7 +223,7 @@ def plane_at_offsets(maps: LocalMaps, patches: Patches, rows: slice, du_px: Arra
     # one set of monomials serves all patches, which differ in scale only
     unit = max(float(np.abs(du_px).max()), float(np.abs(dv_px).max()), 1.0)
     mono = monomials((du_px / unit).astype(np.float32), (dv_px / unit).astype(np.float32), maps.degree)
-    order = np.sum(_powers(maps.degree), axis=1)
+    order = np.sum(powers(maps.degree), axis=1)
     plane = maps.plane[rows] * (unit / patches.scale_px[rows, None, None]) ** order
     return (plane.reshape(-1, len(order)).astype(np.float32) @ mono).reshape(len(plane), 6, -1)
 

@@ -196,14 +196,19 @@ def _coarse_fit(image: NDArray[Any], pattern: Pattern, group: Group, ink: Ink, r
 
 def check_image(image: NDArray[Any], camera: Camera) -> None:
     """Raise ImageError or CameraError unless `image` is a grey picture of the camera's size without NaN."""
-    if image.ndim != 2 or not image.size:
-        raise ImageError(f"the image must be one grey picture (height, width), not an array of shape {image.shape}")
+    check_pixels(image)
     if image.shape != (camera.height_px, camera.width_px):
         size = f"{image.shape[1]}x{image.shape[0]}"
         raise CameraError(
             f"the photograph is {size} px but the camera was calibrated at {camera.width_px}x{camera.height_px} px; "
             "use the camera file made for photographs of this size, without cropping or scaling"
         )
+
+
+def check_pixels(image: NDArray[Any]) -> None:
+    """Raise ImageError unless `image` is a grey picture without NaN."""
+    if image.ndim != 2 or not image.size:
+        raise ImageError(f"the image must be one grey picture (height, width), not an array of shape {image.shape}")
     if image.dtype.kind == "f" and not np.isfinite(image).all():
         raise ImageError("the image holds NaN or infinite pixels; give finite grey levels")
     if image.dtype.itemsize > 4 or image.dtype.kind == "f":
@@ -253,8 +258,8 @@ def _results(image: NDArray[Any], group: Group, adjusted: Adjusted, pixels: Ring
     prior = adjusted.information - adjusted.data_information
     covariance = inverse_scaled(data + prior)
     kept = _kept(adjusted, pixels, count)
-    allowance = _allowance(adjusted.noise_variance, kept)
-    pose_covariance = covariance[:, :6, :6] * allowance[:, None, None]
+    enlarged = allowance(adjusted.noise_variance, kept)
+    pose_covariance = covariance[:, :6, :6] * enlarged[:, None, None]
     steps = poses.steps
     turned = np.zeros((count, 6, 6))
     turned[:, :3, :3], turned[:, 3:, 3:] = steps, np.eye(3)
@@ -280,7 +285,7 @@ def _results(image: NDArray[Any], group: Group, adjusted: Adjusted, pixels: Ring
         "noise": sigma,
         "kept": kept,
     }
-    columns["information"], columns["pull"], columns["prior"] = _likelihood(batch.priors, adjusted, noise.inflation * allowance)
+    columns["information"], columns["pull"], columns["prior"] = _likelihood(batch.priors, adjusted, noise.inflation * enlarged)
     columns["quality"] = _quality(image, group, adjusted, pixels, columns, data + prior, light[:, 0])
     return columns
 
@@ -301,7 +306,7 @@ def _likelihood(priors: Priors, adjusted: Adjusted, enlarged: Array) -> tuple[Ar
     )
 
 
-def _allowance(misfit: Array, kept: Array) -> Array:
+def allowance(misfit: Array, kept: Array) -> Array:
     """Factor (T,) on covariances for what is no noise: a model that does not fit, or an edge that is partly hidden.
 
     Misfit is common to the pixels within a blur of each other, where noise is not; what is left beside an obstacle is pulled

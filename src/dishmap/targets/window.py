@@ -94,7 +94,7 @@ def ring_pixels(
     return _bands(image, rings, maps, patches, ring, half, reach)
 
 
-def _gather(image: NDArray[Any], u: Index, v: Index) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+def gather(image: NDArray[Any], u: Index, v: Index) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Grey levels, whether inside the image, and whether at the end of the scale."""
     height, width = image.shape
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
@@ -111,7 +111,7 @@ def _whole_windows(
     side = 2 * half + 1
     dv, du = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1)
     anchor = patches.anchor_px.astype(int)
-    grey, inside, full = _gather(image, anchor[:, :1] + du, anchor[:, 1:] + dv)
+    grey, inside, full = gather(image, anchor[:, :1] + du, anchor[:, 1:] + dv)
     scale = patches.scale_px[:, None]
     s, t = (du / scale).astype(np.float32), (dv / scale).astype(np.float32)
     # a window may reach into the next target: only pixels near this one's edges count
@@ -133,7 +133,7 @@ def _bands(image: NDArray[Any], rings: Rings, maps: LocalMaps, patches: Patches,
     out_u, out_v = (np.take(d[:, None] + c, block, axis=0).reshape(len(block), -1) for d, c in zip((du, dv), corners, strict=True))
     used = np.repeat(used, 4, axis=1)
     anchor = patches.anchor_px.astype(np.int32)
-    grey, inside, full = _gather(image, anchor[:, :1] + out_u, anchor[:, 1:] + out_v)
+    grey, inside, full = gather(image, anchor[:, :1] + out_u, anchor[:, 1:] + out_v)
     scale = patches.scale_px[:, None].astype(np.float32)
     s, t = out_u.astype(np.float32) / scale, out_v.astype(np.float32) / scale
     clear = rings.gap_mm[ring] / maps.mm_per_px[0][:, None, None] - (reach + stride)

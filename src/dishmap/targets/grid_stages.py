@@ -1,0 +1,246 @@
+"""The stages of the measurement of a grid: a coarse fit to every fourth pixel, what all nodes say of the photograph, the full fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dishmap.targets.grid_arms import arms_there, clear_of_ends, without_arms
+from dishmap.targets.grid_fit import (
+    BEND,
+    BLUR,
+    HALF,
+    INNER,
+    LIGHT,
+    NESTED,
+    OFFSET,
+    PLAIN,
+    SLOPE,
+    NodeFit,
+    NodePriors,
+    Weights,
+    one_step,
+)
+from dishmap.targets.grid_map import LatticeMaps
+from dishmap.targets.grid_pixels import NodePixels, node_pixels
+from dishmap.targets.grid_shapes import NodeShapes
+from dishmap.targets.scene_noise import NoiseModel, inflation_of, noise_model
+from dishmap.targets.solve import inverse_each
+
+Array = NDArray[Any]
+Bool = NDArray[Any]
+Index = NDArray[np.int64]
+
+# Nodes whose pixels together stay in the processor's cache.
+NODES_AT_ONCE = 48
+# Edges are felt this far, in blurs and px; what is looked at before the blur is known.
+REACH_BLURS, REACH_EXTRA_PX = 2.5, 0.5
+FIRST_BLUR_PX, FIRST_REACH_PX = 1.2, 3.5
+FIRST_LOG_BLUR, FIRST_LOG_HALF = 0.7, 0.3
+# What one node may differ from the photograph's usual blur and width at least, as a share.
+LEAST_LOG_BLUR, LEAST_LOG_HALF = 0.1, 0.1
+# A rectangle's own turn and shear, in radians or so.
+FREE_SLOPE = 0.2
+COARSE_STEPS, FULL_STEPS, FREE_STEPS = 7, 6, 2
+CUT = (8.0, 0.1)
+ROBUST_TO_SIGMA = 1.4826
+# A node that moves farther, in lattice units, went astray.
+FARTHEST_MOVE = 0.2
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """What all nodes share: usual blur and its spread (log), half widths over the printed ones and their spread (log), noise."""
+
+    blur_px: float
+    log_blur: float
+    half_ratio: Array
+    log_half: float
+    noise: NoiseModel
+
+    @property
+    def reach_px(self) -> float:
+        """How far from an edge pixels are looked at."""
+        return REACH_BLURS * self.blur_px + REACH_EXTRA_PX
+
+
+@dataclass(frozen=True)
+class Stage:
+    """All nodes after a stage.
+
+    x (N, G), ink_share (N,), light (N, LIGHT), normal (N, G + LIGHT, G + LIGHT), prior (N, G, G), converged, weight, square, kept, whole
+    (N,): as in NodeFit; there (N, 2, 2): arms; saturated (N,): share of pixels; brighter (N,): what differs from the model most is
+    brighter.
+    """
+
+    x: Array
+    ink_share: Array
+    light: Array
+    normal: Array
+    prior: Array
+    there: Bool
+    converged: Bool
+    weight: Array
+    square: Array
+    kept: Array
+    whole: Array
+    saturated: Array
+    brighter: Bool
+
+    def take(self, rows: Any) -> Stage:
+        """Some nodes of the stage."""
+        return Stage(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+
+def chunks(maps: LatticeMaps) -> list[Index]:
+    """Rows of nodes to be worked on together: those of like size in the image, so that padding wastes little."""
+    order = np.argsort(np.linalg.norm(maps.step_px, axis=(1, 2)))
+    count = max(1, -(-len(order) // NODES_AT_ONCE))
+    return np.array_split(order, count)
+
+
+def priors_of(maps: LatticeMaps, shapes: NodeShapes, learnt: Learnt) -> NodePriors:
+    """Priors of n nodes: lines as their neighbours say, widths and blur as all nodes say."""
+    count, size = len(shapes.half), NESTED if shapes.inner.any() else PLAIN
+    mean, precision = np.zeros((count, size)), np.zeros((count, size, size))
+    mean[:, HALF], mean[:, BLUR] = shapes.half * learnt.half_ratio, learnt.blur_px
+    diagonal = np.full((count, size), 1e-9)
+    diagonal[:, HALF] = (learnt.log_half * mean[:, HALF]) ** -2.0
+    diagonal[:, BLUR] = (learnt.log_blur * learnt.blur_px) ** -2.0
+    if size == NESTED:
+        mean[:, INNER] = shapes.inner
+        diagonal[:, INNER] = (FIRST_LOG_HALF * np.where(shapes.inner > 0, shapes.inner, 1.0)) ** -2.0
+    precision[:, range(size), range(size)] = diagonal
+    along = maps.along.copy()
+    if not shapes.crossing:
+        along[:, :, 0] = along[:, :, :, 0] = 0.0
+        along[:, :, 0, 0] = FREE_SLOPE**2
+    known = inverse_each(along + 1e-14 * np.eye(2))
+    for k in (0, 1):
+        slope_bend = np.array([SLOPE.start + k, BEND.start + k])
+        precision[:, slope_bend[:, None], slope_bend] = known[:, k]
+    return NodePriors(mean, precision)
+
+
+def _start(priors: NodePriors) -> Array:
+    x = priors.mean.copy()
+    x[:, [OFFSET.start, OFFSET.start + 1]] = 0.0
+    return x
+
+
+def coarse_stage(
+    image: NDArray[Any], maps: LatticeMaps, shapes: NodeShapes, blur_px: float = FIRST_BLUR_PX, reach_px: float = FIRST_REACH_PX
+) -> tuple[Stage, NoiseModel]:
+    """Fit every fourth pixel of a wide band, first all of them, then without outliers; and the noise that is left."""
+    first = Learnt(blur_px, FIRST_LOG_BLUR, np.ones(2), FIRST_LOG_HALF, NoiseModel(1.0, 0.0, 1.0))
+    rows, parts, left = chunks(maps), [], []
+    for some in rows:
+        part, fit, pixels = _coarse_chunk(image, maps.take(some), shapes.take(some), first, reach_px)
+        parts.append(part)
+        good = part.converged[:, None] & (fit.robust > 0)
+        left.append((pixels.grey, fit.residual, good))
+    noise = noise_model(*([part[i] for part in left] for i in range(3)))
+    stage = _together(parts, rows)
+    # as many degrees of freedom as a node has parameters went into the fit
+    good = stage.converged & (stage.weight > 2 * (PLAIN + LIGHT))
+    freedom = float(np.median(stage.weight[good] / (stage.weight[good] - PLAIN - LIGHT))) if good.any() else 1.0
+    return stage, replace(noise, base=noise.base * freedom, slope=noise.slope * freedom)
+
+
+def _coarse_chunk(
+    image: NDArray[Any], maps: LatticeMaps, shapes: NodeShapes, first: Learnt, reach_px: float
+) -> tuple[Stage, NodeFit, NodePixels]:
+    priors = priors_of(maps, shapes, first)
+    x, share = _start(priors), np.full(len(shapes.half), 0.2)
+    pixels = node_pixels(image, maps, clear_of_ends(shapes, maps, reach_px), x[:, HALF], reach_px, coarse=True)
+    unknown = Weights(1.0, 0.0, None, known=False)
+    there = np.ones((len(x), 2, 2), bool)
+    if shapes.crossing:
+        fit = one_step(pixels, x, share, priors, unknown, shapes.crossing)
+        there = arms_there(pixels, fit, x, first.blur_px)
+        pixels = without_arms(pixels, x, there, reach_px)
+    before, weights = None, unknown
+    for step in range(COARSE_STEPS):
+        fit = one_step(pixels, x, share, priors, weights, shapes.crossing, before)
+        x, share = fit.x, fit.ink_share
+        if step >= FREE_STEPS - 1:
+            some = np.abs(fit.residual[fit.robust > 0])
+            sigma = ROBUST_TO_SIGMA * float(np.median(some)) if len(some) else 1.0
+            weights, before = Weights(max(sigma, 0.05) ** 2, 0.0, CUT), fit.robust
+            if step > FREE_STEPS and fit.converged.all():
+                break
+    return _stage(fit, there, pixels), fit, pixels
+
+
+def _stage(fit: NodeFit, there: Bool, pixels: NodePixels) -> Stage:
+    odd = np.where(pixels.used, fit.residual, 0.0)
+    brighter = (odd.max(axis=1) > -odd.min(axis=1)) if odd.shape[1] else np.zeros(len(odd), bool)
+    columns = (fit.x, fit.ink_share, fit.light, fit.normal, fit.prior, there, fit.converged, fit.weight, fit.square, fit.kept, fit.whole)
+    return Stage(*columns, pixels.saturated, brighter)
+
+
+def _together(parts: list[Stage], rows: list[Index]) -> Stage:
+    """Parts in the order of their rows."""
+    order = np.argsort(np.concatenate(rows))
+    return Stage(*(np.concatenate([getattr(part, name) for part in parts])[order] for name in Stage.__dataclass_fields__))
+
+
+def learn(stage: Stage, shapes: NodeShapes, good: Bool, noise: NoiseModel) -> Learnt:
+    """What the good nodes say together."""
+    if not good.any():
+        return Learnt(FIRST_BLUR_PX, FIRST_LOG_BLUR, np.ones(2), FIRST_LOG_HALF, noise)
+    blur, ratio = np.log(stage.x[good, BLUR]), np.log(stage.x[good, HALF] / shapes.half[good])
+    usual, usual_ratio = np.median(blur), np.median(ratio, axis=0)
+    spread, spread_ratio = (ROBUST_TO_SIGMA * float(np.median(np.abs(v - m))) for v, m in ((blur, usual), (ratio, usual_ratio)))
+    # a rectangle's size is measured, not assumed
+    log_half = max(spread_ratio, LEAST_LOG_HALF) if shapes.crossing else FIRST_LOG_HALF
+    return Learnt(float(np.exp(usual)), max(spread, LEAST_LOG_BLUR), np.exp(usual_ratio), log_half, noise)
+
+
+def full_stage(image: NDArray[Any], maps: LatticeMaps, shapes: NodeShapes, coarse: Stage, learnt: Learnt) -> tuple[Stage, NoiseModel]:
+    """Fit all pixels near the edges, from the coarse stage, in the maps through its places; and the noise of the photograph."""
+    rows, parts, white = chunks(maps), [], []
+    for some in rows:
+        part, seen = _full_chunk(image, maps.take(some), shapes.take(some), coarse.take(some), learnt)
+        parts.append(part)
+        white.append(seen)
+    stage = _together(parts, rows)
+    size = stage.x.shape[1] + LIGHT
+    good = stage.converged & (stage.weight > 2 * size)
+    ratio = float(np.median(stage.square[good] / (stage.weight[good] - size))) if good.any() else 1.0
+    inflation = inflation_of([w for w, _ in white], [u for _, u in white])
+    noise = NoiseModel(learnt.noise.base * ratio, learnt.noise.slope * ratio, inflation)
+    return replace(stage, normal=stage.normal / ratio, square=stage.square / ratio), noise
+
+
+def _full_chunk(
+    image: NDArray[Any], maps: LatticeMaps, shapes: NodeShapes, coarse: Stage, learnt: Learnt
+) -> tuple[Stage, tuple[Array, Bool]]:
+    priors = priors_of(maps, shapes, learnt)
+    x = _start(priors)
+    x[:, HALF.start :] = coarse.x[:, HALF.start :]
+    if not shapes.crossing:
+        x[:, SLOPE] = coarse.x[:, SLOPE]
+    pixels = node_pixels(image, maps, clear_of_ends(shapes, maps, learnt.reach_px), x[:, HALF], learnt.reach_px, coarse=False)
+    if shapes.crossing:
+        pixels = without_arms(pixels, x, coarse.there, learnt.reach_px)
+    weights = Weights(learnt.noise.base, learnt.noise.slope, CUT)
+    fit = one_step(pixels, x, coarse.ink_share, priors, weights, shapes.crossing)
+    stage, white, used = _stage(fit, coarse.there, pixels), fit.white, fit.robust > 0
+    before = fit.robust.copy()
+    rest = np.flatnonzero(~fit.converged)
+    for _ in range(FULL_STEPS):
+        if not len(rest):
+            break
+        some = pixels.take(np.isin(np.arange(len(x)), rest))
+        own = NodePriors(priors.mean[rest], priors.precision[rest])
+        fit = one_step(some, stage.x[rest], stage.ink_share[rest], own, weights, shapes.crossing, before[rest])
+        part = _stage(fit, coarse.there[rest], some)
+        for name in Stage.__dataclass_fields__:
+            getattr(stage, name)[rest] = getattr(part, name)
+        white[rest], used[rest], before[rest] = fit.white, fit.robust > 0, fit.robust
+        rest = rest[~fit.converged]
+    return stage, (white, used)
