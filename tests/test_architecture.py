@@ -42,7 +42,7 @@ ORDER = [
     *("targets.adjust", "targets.start", "targets.sensitivity", "targets.scene_noise", "targets.glare", "targets.stages"),
     *("targets.settle", "targets.pose", "targets.track"),
     # and the nodes of grids
-    *("targets.grid_map", "targets.grid_shapes", "targets.grid_pixels", "targets.grid_fit", "targets.grid_arms", "targets.grid_stages"),
+    *("targets.lattice_map", "targets.grid_shapes", "targets.grid_pixels", "targets.grid_fit", "targets.grid_arms", "targets.grid_stages"),
     *("targets.grid_outcome", "targets.grid_points"),
     # boards of circles
     *("camera.board_labels", "camera.circle_board"),

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from grids import Drawing, Lift, bowl, cylinder, facing, flat, line_grid, square_grid
+from grid_drawing import Drawing, Lift, bowl, cylinder, facing, flat, line_grid, square_grid
 from numpy.typing import NDArray
 
 from dishmap.camera.model import Camera

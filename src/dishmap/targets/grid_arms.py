@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.targets.grid_fit import HALF, NodeFit
-from dishmap.targets.grid_map import LatticeMaps
 from dishmap.targets.grid_pixels import NodePixels
 from dishmap.targets.grid_shapes import CELL, NodeShapes
+from dishmap.targets.lattice_map import LatticeMaps
 
 Array = NDArray[Any]
 Bool = NDArray[Any]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.targets.grid_fit import BEND, HALF, LIGHT, OFFSET, SLOPE
-from dishmap.targets.grid_map import LatticeMaps
+from dishmap.targets.lattice_map import LatticeMaps
 from dishmap.targets.solve import inverse_each, inverse_scaled
 
 Array = NDArray[Any]

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.targets.edges import monomials
-from dishmap.targets.grid_map import BY_FIRST, BY_SECOND, DEGREE, LatticeMaps
 from dishmap.targets.grid_shapes import CELL, NodeShapes
+from dishmap.targets.lattice_map import BY_FIRST, BY_SECOND, DEGREE, LatticeMaps
 from dishmap.targets.window import gather
 
 Array = NDArray[Any]

@@ -17,10 +17,10 @@ from threadpoolctl import threadpool_limits
 from dishmap.errors import InputError, MeasurementError
 from dishmap.quality import Quality, is_rejected, names
 from dishmap.targets.grid_fit import BLUR, HALF, LIGHT
-from dishmap.targets.grid_map import LatticeMaps, lattice_maps, place_sigma_px
 from dishmap.targets.grid_outcome import information_of, measured_vector
 from dishmap.targets.grid_shapes import NodeShapes, node_shapes
 from dishmap.targets.grid_stages import FARTHEST_MOVE, Stage, coarse_stage, full_stage, learn
+from dishmap.targets.lattice_map import LatticeMaps, lattice_maps, place_sigma_px
 from dishmap.targets.pattern import Pattern
 from dishmap.targets.pose import (
     HIDDEN_BELOW,

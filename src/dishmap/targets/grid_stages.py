@@ -24,9 +24,9 @@ from dishmap.targets.grid_fit import (
     Weights,
     one_step,
 )
-from dishmap.targets.grid_map import LatticeMaps
 from dishmap.targets.grid_pixels import NodePixels, node_pixels
 from dishmap.targets.grid_shapes import NodeShapes
+from dishmap.targets.lattice_map import LatticeMaps
 from dishmap.targets.scene_noise import NoiseModel, inflation_of, noise_model
 from dishmap.targets.solve import inverse_each
 
