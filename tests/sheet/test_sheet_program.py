@@ -67,6 +67,18 @@ def test_symmetry_is_said(tmp_path: Path) -> None:
     assert "looks the same after 1 turn," in dishmap("sheet", *rings, "--no-orientation-marks", "--out", tmp_path / "d").stdout
 
 
+def test_boards_are_said_to_be_better_on_one_sheet_and_not_square(tmp_path: Path) -> None:
+    rings = ["board", "--kind", "rings", "--pitch-mm", 25, "--out", tmp_path]
+    assert "glued of several sheets is hardly flat" in dishmap("sheet", *rings, "--grid", "12x9").stdout
+    assert "glued of several sheets" not in dishmap("sheet", *rings, "--grid", "7x6").stdout
+    assert "glued of several sheets" not in dishmap("sheet", "plate", "--rows", 9, "--columns", 9, "--pitch-mm", 45, "--out", tmp_path).stdout
+    square = dishmap("sheet", "board", "--kind", "chessboard", "--corners", "6x6", "--square-mm", 20, "--out", tmp_path).stdout
+    assert "the board looks the same after a quarter turn" in square
+    assert "take more corners one way" in square
+    assert "quarter turn" not in dishmap("sheet", *CHESS, "--out", tmp_path).stdout
+    assert "board.json: what is printed, for `dishmap calibrate --board`" in square
+
+
 def test_targets_without_a_free_cut_lie_on_tabs_and_are_said(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     xy = np.zeros((0, 2))

@@ -58,7 +58,7 @@ def calibrate_command(
     **described: Any,
 ) -> None:
     """Calibrate a camera from 10 to 20 photographs of a flat board, tilted to all sides, with fixed focus and zoom."""
-    from dishmap.io.atomic import output_folder, write_files
+    from dishmap.io.atomic import check_target, output_folder, write_files
     from dishmap.io.camera_file import camera_text
     from dishmap.io.camera_formats import SUFFIXES, camera_in_format
 
@@ -69,6 +69,7 @@ def calibrate_command(
         raise InputError(f"--out {out} is the name of another file that is written; give one that ends in .yaml")
     for file in (out, page, *files.values()):
         refuse_overwriting(file, [*photos, *board_file(board)])
+        check_target(file)
     with output_folder(out.parent):
         names = _names(photos)
         result, choice, not_found = _calibrated(what, photos, names, lens, flat_board)

@@ -159,7 +159,7 @@ def board_sheet(kind: str, out: Path, **options: Any) -> None:
     _check_words(kind, given, needs, takes)
     if "no_orientation_marks" in given:
         given["marks"] = not given.pop("no_orientation_marks")
-    _make(build(**given), out, **_only_sheet_options(options))  # type: ignore[operator]
+    _make(build(**given), out, board=True, **_only_sheet_options(options))  # type: ignore[operator]
 
 
 def _check_words(kind: str, given: dict[str, Any], needs: tuple[str, ...], takes: tuple[str, ...]) -> None:
@@ -193,8 +193,9 @@ def _make(
     corner_marks: str | None,
     measured_mm: list[float] | None,
     largest_strain_percent: float = 0.2,
+    board: bool = False,
 ) -> None:
-    """Write the sheets of a pattern or a board, or with measured bars what they became."""
+    """Write the sheets of a pattern or a board, or with measured bars what they became. board: it is for calibration."""
     from dishmap.io.atomic import output_folder, write_text
     from dishmap.io.sheet_file import drawn_name, format_drawn, write_sheets
     from dishmap.sheet.boards import CornerBoard
@@ -215,7 +216,7 @@ def _make(
     if measured_mm is not None:
         _say_printed(sheets, measured_mm, out / name)
     else:
-        _say_sheets(sheets, out)
+        _say_sheets(sheets, out, board)
 
 
 def _say_printed(sheets: Sheets, measured_mm: list[float], file: Path) -> None:
@@ -231,22 +232,22 @@ def _say_printed(sheets: Sheets, measured_mm: list[float], file: Path) -> None:
         )
 
 
-def _say_sheets(sheets: Sheets, out: Path) -> None:
+def _say_sheets(sheets: Sheets, out: Path, board: bool) -> None:
     from dishmap.io.sheet_file import PDF_NAME, drawn_name
 
     paper = sheets.paper
     many = f"{len(sheets.pages)} sheet{'s' * (len(sheets.pages) > 1)}"
     say(f"{out / PDF_NAME}: {many} of {paper.width_mm:g}x{paper.height_mm:g} mm; each is there as SVG too")
-    say(f"{out / drawn_name(sheets.what)}: what is printed, for `dishmap` to measure with")
+    say(f"{out / drawn_name(sheets.what)}: what is printed, for `dishmap {'calibrate --board' if board else 'map --pattern'}`")
     if len(sheets.pieces) > 1 or sheets.strain > 0:
         pieces = f"{len(sheets.pieces)} piece{'s' * (len(sheets.pieces) > 1)}"
         say(f"  {pieces}; a length in a target is printed up to {sheets.strain:.3%} longer than it is on the dish")
-    _say_cuts(sheets)
+    _say_cuts(sheets, board)
     _say_identity(sheets)
     say(f"  print at 100 %, measure both bars, and if they are not {paper.bar_mm:g} mm run this again with --measured-mm XxY")
 
 
-def _say_cuts(sheets: Sheets) -> None:
+def _say_cuts(sheets: Sheets, board: bool) -> None:
     from dishmap.targets.pattern import Pattern
 
     what = sheets.what
@@ -257,7 +258,7 @@ def _say_cuts(sheets: Sheets) -> None:
             say(f"  {len(names)} target{'s' * (len(names) > 1)} reach over {by} ({listed}): cut around the tabs, glue them on top")
         elif cut:
             say(f"  {len(cut)} corners or marks of the board lie on {by}: take larger paper")
-    if not isinstance(what, Pattern) and len(sheets.pages) > 1:
+    if board and len(sheets.pages) > 1:
         say("  a board glued of several sheets is hardly flat and true at its joints; larger paper is better")
 
 

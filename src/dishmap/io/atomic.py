@@ -53,16 +53,28 @@ def write_files(folder: str | Path, files: Mapping[str, str | bytes]) -> None:
         raise
 
 
-def _stage(path: Path, data: bytes, pairs: list[tuple[Path, Path]]) -> None:
-    """Write `data` beside `path` and note the pair, or straight into a device or pipe, which cannot be replaced."""
+def check_target(path: str | Path) -> None:
+    """Raise InputError, before long work begins, when a folder or a read-only file is where `path` is to be written."""
+    with _as_input_error(Path(path)):
+        _target(Path(path))
+
+
+def _target(path: Path) -> Path:
+    """The file that `path` leads to, which may be written as far as can be seen."""
     target = Path(os.path.realpath(path))  # a link stays a link
     if not path.name or target.is_dir():
         raise IsADirectoryError(None, "it is a folder, and a file is to be written")
+    if target.is_file() and not os.access(target, os.W_OK):
+        raise PermissionError(None, "the file there is read-only")
+    return target
+
+
+def _stage(path: Path, data: bytes, pairs: list[tuple[Path, Path]]) -> None:
+    """Write `data` beside `path` and note the pair, or straight into a device or pipe, which cannot be replaced."""
+    target = _target(path)
     if target.exists() and not stat.S_ISREG(target.stat().st_mode):
         target.write_bytes(data)
         return
-    if target.exists() and not os.access(target, os.W_OK):
-        raise PermissionError(None, "the file there is read-only")
     temporary = target.parent / f".{target.name[:KEPT_OF_NAME]}.{os.getpid()}-{next(_count)}.part"
     pairs.append((temporary, target))
     with temporary.open("xb") as stream:
