@@ -33,7 +33,7 @@ ORDER = [
     # how a printed membrane moves
     *("surface.membrane",),
     # finding it
-    *("targets.ellipses", "targets.detect", "targets.subpixel"),
+    *("targets.threshold", "targets.ellipses", "targets.detect", "targets.subpixel"),
     # naming it
     *("targets.layout", "targets.rigid", "targets.markgrid", "targets.candidates", "targets.growth", "targets.constellations"),
     *("targets.beam", "targets.search", "targets.rivals", "targets.identify"),
@@ -95,6 +95,7 @@ WALLS = {
         "camera.undistort",
         "camera.chessboard",
         "camera.charuco",
+        "targets.threshold",
         "targets.detect",
         "io.images",
         "io.camera_file",

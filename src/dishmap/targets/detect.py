@@ -1,18 +1,12 @@
 """Find circles in a photograph: local threshold, contours, ellipses (the paper's section 4.2, step 1).
 
-The threshold of a pixel is half way between the darkest and the lightest pixel of a small window around it, so it follows
-shading of any strength and needs no idea of a circle's size: only the neighbourhood of edges is ever told apart, and a
-large disc shows as the contour of its edge. A contour that does not follow an edge is dropped point by point, when it
-is moved to the crossing of the threshold between two pixels.
-
-Blur fills narrow gaps and small holes to beyond that threshold: small circles run together and lose their holes. Where
-contours are small or no ellipses, a second threshold is tried, the mean of a few pixels around. It follows the sign of the
-curvature of the grey levels, which parts two edges as long as there is any dip between them.
+The threshold is local (`targets/threshold.py`). Blur fills narrow gaps and small holes to beyond it: small circles run together
+and lose their holes. Where contours are small or no ellipses, a second threshold is tried, the mean of a few pixels around. It
+follows the sign of the curvature of the grey levels, which parts two edges as long as there is any dip between them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,22 +16,22 @@ from numpy.typing import NDArray
 
 from dishmap.errors import ImageError
 from dishmap.targets.ellipses import Fits, contour_spread, enclosing, fit_ellipses
+from dishmap.targets.threshold import (
+    LEAST_CONTRAST,
+    concatenated,
+    ink_contours,
+    noise_level,
+    reduced_image,
+    row_bands,
+    signed_area,
+    to_crossing,
+    white_level,
+    window_edges,
+)
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-# Half width of the window whose darkest and lightest pixels give the threshold. It must hold both sides of an edge blurred
-# by 2 px (sigma); a larger one would let dark surroundings into the windows of circles near them.
-WINDOW_PX = 5
-# The window must hold at least this contrast, as a part of its lightest pixel, in grey levels of 255, and in sigmas of
-# the noise (the range of 121 normal numbers is 5.4 sigmas).
-LEAST_RELATIVE_CONTRAST = 0.15
-LEAST_CONTRAST = 5.0
-LEAST_CONTRAST_SIGMAS = 8.0
-# Above this noise (grey levels of 255) the image is smoothed by a 3x3 kernel first.
-SMOOTH_ABOVE_NOISE = 2.0
-# Rows treated at a time, to keep the memory small.
-BAND_ROWS = 512
 # Above this many pixels the search runs at half resolution first.
 HALVE_ABOVE_PX = 6_000_000
 # Circles found at half resolution with a smaller half axis than this are too coarse there, and so is the search when
@@ -100,17 +94,17 @@ def find_ellipses(gray: NDArray[Any], full_resolution: bool = False) -> Detectio
         raise ImageError(
             f"circles are searched in a grey image (H, W) of uint8 or uint16, not in {gray.dtype} {gray.shape}; convert it first"
         )
-    white = _white_level(gray)
+    white = white_level(gray)
     halve = gray.size > HALVE_ABOVE_PX and not full_resolution
     base = 2 if halve else 1
-    image = _reduced(gray, base, white)
-    noise = _noise(image)
+    image = reduced_image(gray, base, white)
+    noise = noise_level(image)
     found, small = _search_closely(image, base, noise)
     if halve and _too_coarse(found, base, small):
-        found, _ = _search_closely(_reduced(gray, 1, white), 1, noise * 2)
+        found, _ = _search_closely(reduced_image(gray, 1, white), 1, noise * 2)
     if min(image.shape) >= 16 * SECOND_REDUCTION:
         second = 2 * SECOND_REDUCTION if halve else SECOND_REDUCTION
-        coarse, *_ = _search(_reduced(image, SECOND_REDUCTION, 255.0), second, noise / SECOND_REDUCTION)
+        coarse, *_ = _search(reduced_image(image, SECOND_REDUCTION, 255.0), second, noise / SECOND_REDUCTION)
         found = _merged(found, coarse, SAME_SIZE)
     return _detections(found, white / 255.0)
 
@@ -131,40 +125,13 @@ class _Found:
         return _Found(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
 
-def _white_level(gray: NDArray[Any]) -> float:
-    """Grey level that becomes 255: all of an 8-bit image, and the light end of the pixels of a 16-bit one."""
-    if gray.dtype == np.uint8:
-        return 255.0
-    sample = gray[:: max(1, gray.shape[0] // 500), :: max(1, gray.shape[1] // 500)]
-    return float(max(1.2 * np.percentile(sample, 99.5), 255.0))
-
-
-def _reduced(image: NDArray[Any], factor: int, white: float) -> Image:
-    """The image averaged over blocks of factor x factor pixels, as 8 bit; rows and columns left over are dropped."""
-    h, w = image.shape[0] // factor, image.shape[1] // factor
-    if factor > 1:
-        image = cv2.resize(image[: h * factor, : w * factor], (w, h), interpolation=cv2.INTER_AREA)
-    if image.dtype != np.uint8:
-        image = cv2.convertScaleAbs(image, alpha=255.0 / white)
-    return np.ascontiguousarray(image)
-
-
-def _noise(image: Image) -> float:
-    """Standard deviation of the noise, grey levels: from the median difference of diagonal 2x2 sums."""
-    rows = image[:: max(1, image.shape[0] // 64)].astype(np.int16)
-    if rows.shape[1] < 4:
-        return 0.0
-    second = rows[:, 2:] - 2 * rows[:, 1:-1] + rows[:, :-2]
-    return float(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0))
-
-
 def _search_closely(image: Image, reduction: int, noise: float) -> tuple[_Found, int]:
     """All ellipses of one image, those that run together too; also how many small blobs its contours hold."""
     found, small, unclear = _search(image, reduction, noise)
     fine = found.semi_axes[:, 1] < np.where(found.dark, CLOSE_BELOW_PX, CLOSE_BELOW_LIGHT_PX) * reduction
     v, reach = found.center[fine, 1] / reduction, found.semi_axes[fine, 0] / reduction
     rows = np.concatenate([unclear, np.column_stack([v - reach, v + reach])])
-    bands = [(top, bottom) for top, bottom in _bands(len(image)) if ((rows[:, 0] < bottom) & (rows[:, 1] >= top)).any()]
+    bands = [(top, bottom) for top, bottom in row_bands(len(image)) if ((rows[:, 0] < bottom) & (rows[:, 1] >= top)).any()]
     if not bands:
         return found, small
     return _merged(found, _search_by_mean(image, reduction, noise, bands), SAME_SIZE_BY_MEAN), small
@@ -172,12 +139,9 @@ def _search_closely(image: Image, reduction: int, noise: float) -> tuple[_Found,
 
 def _search(image: Image, reduction: int, noise: float) -> tuple[_Found, int, Array]:
     """All ellipses of one image; how many small blobs its contours hold; first and last rows (U, 2) of clumps that are no ellipse."""
-    if noise > SMOOTH_ABOVE_NOISE:
-        image, noise = np.asarray(cv2.GaussianBlur(image, (3, 3), 0), dtype=np.uint8), noise / 2.5
-    threshold, ink = _binarise(image, min(max(LEAST_CONTRAST, LEAST_CONTRAST_SIGMAS * noise), 255.0))
-    outlines, _ = cv2.findContours(ink, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    image, threshold, outlines = ink_contours(image, noise)
     small = sum(1 for c in outlines if 4 <= len(c) < FEWEST_POINTS)
-    contours = [np.asarray(c, dtype=np.int32) for c in outlines if len(c) >= FEWEST_POINTS]
+    contours = [c for c in outlines if len(c) >= FEWEST_POINTS]
     found, which = _ellipses(image, threshold, contours, reduction, LARGEST_SPREAD, RMS_PX)
     rest = [contours[i] for i in np.setdiff1d(np.arange(len(contours)), which)]
     rows = [(c[:, 0, 1].min(), c[:, 0, 1].max()) for c in rest if cv2.contourArea(c) <= CLUMP_WIDTH_PX * len(c)]
@@ -194,38 +158,12 @@ def _search_by_mean(image: Image, reduction: int, noise: float, bands: list[tupl
         part = np.asarray(cv2.GaussianBlur(image[first:last], (0, 0), MEAN_SMOOTH_PX), dtype=np.uint8)
         smooth[top:bottom] = part[inner]
         mean[top:bottom] = cv2.GaussianBlur(image[first:last], (0, 0), MEAN_PX)[inner]
-        edges = _edges(part, least_contrast)[2][inner]
+        edges = window_edges(part, least_contrast)[2][inner]
         cv2.bitwise_and(cv2.compare(smooth[top:bottom], mean[top:bottom], cv2.CMP_LT), edges, dst=ink[top:bottom])
     outlines, _ = cv2.findContours(ink, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     contours = [np.asarray(c, dtype=np.int32) for c in outlines if len(c) >= FEWEST_POINTS]
     found, _ = _ellipses(smooth, mean, contours, reduction, LARGEST_SPREAD_BY_MEAN, RMS_PX_BY_MEAN)
     return found.take(np.flatnonzero((found.contrast >= least_contrast) & (found.semi_axes[:, 0] <= CLOSE_UP_TO_PX * reduction)))
-
-
-def _binarise(image: Image, least_contrast: float) -> tuple[Image, Image]:
-    """Threshold of each pixel, and where the image is ink (255)."""
-    threshold, ink = np.empty_like(image), np.empty_like(image)
-    for top, bottom in _bands(len(image)):
-        first, last = max(0, top - WINDOW_PX), min(len(image), bottom + WINDOW_PX)
-        inner = slice(top - first, bottom - first)
-        low, high, edges = (part[inner] for part in _edges(image[first:last], least_contrast))
-        cv2.addWeighted(low, 0.5, high, 0.5, 0.0, dst=threshold[top:bottom])
-        cv2.bitwise_and(cv2.compare(image[top:bottom], threshold[top:bottom], cv2.CMP_LT), edges, dst=ink[top:bottom])
-    return threshold, ink
-
-
-def _edges(image: Image, least_contrast: float) -> tuple[Image, Image, Image]:
-    """Darkest and lightest pixel of the window around each pixel, and where these are far enough apart for an edge (255)."""
-    kernel = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * WINDOW_PX + 1, 2 * WINDOW_PX + 1))
-    low, high = (np.asarray(f(image, kernel), dtype=np.uint8) for f in (cv2.erode, cv2.dilate))
-    # contrast of the window against its own limit: high - low > max(least, part * high)
-    limit = np.maximum(cv2.convertScaleAbs(high, alpha=LEAST_RELATIVE_CONTRAST), np.uint8(least_contrast))
-    return low, high, np.asarray(cv2.compare(cv2.subtract(high, low), limit, cv2.CMP_GT), dtype=np.uint8)
-
-
-def _bands(rows: int) -> Iterator[tuple[int, int]]:
-    for top in range(0, rows, BAND_ROWS):
-        yield top, min(rows, top + BAND_ROWS)
 
 
 def _ellipses(
@@ -234,24 +172,24 @@ def _ellipses(
     """Ellipses of the contours that pass all tests, in full-resolution pixels, and which contours these are."""
     if not contours:
         return _nothing(), np.zeros(0, dtype=np.int64)
-    points, starts = _concatenated(contours)
+    points, starts = concatenated(contours)
     counts = np.diff(np.append(starts, len(points)))
     which = np.flatnonzero(contour_spread(points, starts) < largest_spread[0] + largest_spread[1] / counts)
     if not len(which):
         return _nothing(), which
-    points, starts = _concatenated([contours[i] for i in which])
+    points, starts = concatenated([contours[i] for i in which])
     counts = np.diff(np.append(starts, len(points)))
     # OpenCV runs around ink one way and around holes in it the other way
-    dark = _signed_area(points, starts, counts) > 0
+    dark = signed_area(points, starts, counts) > 0
     mean = np.stack([np.add.reduceat(points[:, k], starts) for k in (0, 1)], axis=1) / counts[:, None]
     outward = (points - np.repeat(mean, counts, axis=0)) * np.repeat(np.where(dark, 1.0, -1.0), counts)[:, None]
-    moved, good, contrast = _to_crossing(image, threshold, points, outward)
+    moved, good, contrast = to_crossing(image, threshold, points, outward)
     weights = good.astype(float)
     enough = np.add.reduceat(weights, starts) >= np.maximum(LEAST_GOOD_POINTS * counts, FEWEST_POINTS - 2)
     fits = fit_ellipses(moved, starts, weights)
     contrast_mean = np.add.reduceat(contrast * weights, starts) / np.maximum(np.add.reduceat(weights, starts), 1.0)
     with np.errstate(invalid="ignore"):
-        keep = enough & _is_ellipse(fits, np.abs(_signed_area(moved, starts, counts)), rms_px)
+        keep = enough & _is_ellipse(fits, np.abs(signed_area(moved, starts, counts)), rms_px)
     found = _Found(
         fits.center * reduction + (reduction - 1) / 2,
         fits.semi_axes * reduction,
@@ -264,11 +202,6 @@ def _ellipses(
     return found.take(np.flatnonzero(keep)), which[keep]
 
 
-def _concatenated(contours: list[NDArray[np.int32]]) -> tuple[Array, NDArray[np.int64]]:
-    points = np.concatenate(contours)[:, 0].astype(float)
-    return points, np.cumsum([0] + [len(c) for c in contours[:-1]])
-
-
 def _is_ellipse(fits: Fits, area: Array, rms_px: float) -> NDArray[np.bool_]:
     major, minor = fits.semi_axes.T
     return np.asarray(
@@ -277,48 +210,6 @@ def _is_ellipse(fits: Fits, area: Array, rms_px: float) -> NDArray[np.bool_]:
         & (fits.rms <= rms_px + RMS_PART * np.sqrt(major * minor))
         & (np.abs(area / (np.pi * major * minor) - 1) <= AREA_TOLERANCE)
     )
-
-
-def _signed_area(points: Array, starts: NDArray[np.int64], counts: NDArray[np.int64]) -> Array:
-    """Area (M,) of each closed contour, negative when it runs from +u towards +v."""
-    following = np.arange(1, len(points) + 1)
-    following[starts + counts - 1] = starts
-    x, y = points.T
-    return np.asarray(np.add.reduceat(x[following] * y - x * y[following], starts) / 2)
-
-
-def _to_crossing(image: Image, threshold: Image, points: Array, outward: Array) -> tuple[Array, NDArray[np.bool_], Array]:
-    """Move contour pixels (N, 2), the last ink before the ground, to where the grey level crosses the threshold.
-
-    outward (N, 2): direction from the ink to the ground, roughly. The crossing is taken between the pixel and that one of
-    its four neighbours which is lighter and lies best in this direction, by linear interpolation: so the contour lies
-    neither on the inner nor on the outer side. Returns the points, where there is a crossing, and the contrast there.
-    """
-    h, w = image.shape
-    x, y = points.T.astype(np.intp)
-    good = (x > 0) & (y > 0) & (x < w - 1) & (y < h - 1)
-    flat, at = image.ravel(), np.where(good, y * w + x, 0)
-    here, level = flat[at].astype(np.float32), threshold.ravel()[at].astype(np.float32)
-    towards = (outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)).astype(np.float32)
-    best, best_value = np.zeros_like(here), here
-    step = np.zeros_like(towards)
-    for k, direction in ((1, (1, 0)), (-1, (-1, 0)), (w, (0, 1)), (-w, (0, -1))):
-        value = flat[np.where(good, at + k, 0)].astype(np.float32)
-        score = (value - here) * np.maximum(towards[:, 0] * direction[0] + towards[:, 1] * direction[1], 0)
-        better = score > best
-        best, best_value = np.where(better, score, best), np.where(better, value, best_value)
-        step[better] = direction
-    good &= best_value > level
-    part = np.where(good, (level - here) / np.where(good, best_value - here, 1), 0)
-    contrast = 2 * (level - _darkest(flat, at, w, here))
-    return points + step * np.clip(part, 0, 1)[:, None], good, np.asarray(contrast, dtype=float)
-
-
-def _darkest(flat: Image, at: NDArray[np.intp], width: int, here: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Darkest of the pixel and its eight neighbours, so that the contrast counts the ink's own depth."""
-    for k in (1, -1, width, -width, width + 1, width - 1, -width + 1, -width - 1):
-        here = np.minimum(here, flat[np.clip(at + k, 0, flat.size - 1)])
-    return here
 
 
 def _too_coarse(found: _Found, reduction: int, small_blobs: int) -> bool:
