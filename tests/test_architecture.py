@@ -34,6 +34,8 @@ ORDER = [
     *("surface.membrane",),
     # finding it
     *("targets.threshold", "targets.ellipses", "targets.detect", "targets.subpixel"),
+    *("targets.grid_nodes", "targets.grid_squares", "targets.grid_crossings", "targets.grid_map", "targets.grid_links"),
+    *("targets.grid_walk", "targets.grid_refine", "targets.grid_detect"),
     # naming it
     *("targets.layout", "targets.rigid", "targets.markgrid", "targets.candidates", "targets.growth", "targets.constellations"),
     *("targets.beam", "targets.search", "targets.rivals", "targets.identify"),
@@ -97,6 +99,8 @@ WALLS = {
         "camera.charuco",
         "targets.threshold",
         "targets.detect",
+        "targets.grid_crossings",
+        "targets.grid_refine",
         "io.images",
         "io.camera_file",
         "io.picture_file",

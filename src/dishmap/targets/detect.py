@@ -19,12 +19,12 @@ from dishmap.targets.ellipses import Fits, contour_spread, enclosing, fit_ellips
 from dishmap.targets.threshold import (
     LEAST_CONTRAST,
     concatenated,
+    edge_points,
     ink_contours,
     noise_level,
     reduced_image,
     row_bands,
     signed_area,
-    to_crossing,
     white_level,
     window_edges,
 )
@@ -177,13 +177,7 @@ def _ellipses(
     which = np.flatnonzero(contour_spread(points, starts) < largest_spread[0] + largest_spread[1] / counts)
     if not len(which):
         return _nothing(), which
-    points, starts = concatenated([contours[i] for i in which])
-    counts = np.diff(np.append(starts, len(points)))
-    # OpenCV runs around ink one way and around holes in it the other way
-    dark = signed_area(points, starts, counts) > 0
-    mean = np.stack([np.add.reduceat(points[:, k], starts) for k in (0, 1)], axis=1) / counts[:, None]
-    outward = (points - np.repeat(mean, counts, axis=0)) * np.repeat(np.where(dark, 1.0, -1.0), counts)[:, None]
-    moved, good, contrast = to_crossing(image, threshold, points, outward)
+    moved, starts, counts, dark, good, contrast = edge_points(image, threshold, [contours[i] for i in which])
     weights = good.astype(float)
     enough = np.add.reduceat(weights, starts) >= np.maximum(LEAST_GOOD_POINTS * counts, FEWEST_POINTS - 2)
     fits = fit_ellipses(moved, starts, weights)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
+Flags = NDArray[np.bool_]
 
 # Half width of the window whose darkest and lightest pixels give the threshold. It must hold both sides of an edge blurred
 # by 2 px (sigma); a larger one would let dark surroundings into the windows of circles near them.
@@ -39,6 +40,24 @@ def ink_contours(image: Image, noise: float) -> tuple[Image, Image, list[NDArray
     threshold, ink = binarise(image, min(max(LEAST_CONTRAST, LEAST_CONTRAST_SIGMAS * noise), 255.0))
     outlines, _ = cv2.findContours(ink, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     return image, threshold, [np.asarray(c, dtype=np.int32) for c in outlines]
+
+
+def edge_points(
+    image: Image, threshold: Image, contours: list[NDArray[np.int32]]
+) -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Flags, Flags, Array]:
+    """The points of outlines on the edges that they follow.
+
+    Returns points (N, 2), where each outline starts and how many points it has (M,), whether its inside is dark (M,), which points (N,)
+    lie on an edge, and the contrast (N,) there.
+    """
+    points, starts = concatenated(contours)
+    counts = np.diff(np.append(starts, len(points)))
+    # OpenCV runs around ink one way and around holes in it the other way
+    dark = signed_area(points, starts, counts) > 0
+    mean = np.stack([np.add.reduceat(points[:, k], starts) for k in (0, 1)], axis=1) / counts[:, None]
+    outward = (points - np.repeat(mean, counts, axis=0)) * np.repeat(np.where(dark, 1.0, -1.0), counts)[:, None]
+    moved, good, contrast = to_crossing(image, threshold, points, outward)
+    return moved, starts, counts, dark, good, contrast
 
 
 def white_level(gray: NDArray[Any]) -> float:
