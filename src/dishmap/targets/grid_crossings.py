@@ -87,22 +87,20 @@ def _best(place: Array, response: Array, reduction: NDArray[np.int64]) -> Flags:
 def _crossings_of(level: Level) -> tuple[Array, Array, Array]:
     """Places (M, 2) px, unit axes (M, 2, 2) and responses (M,) of the crossings in one level."""
     image = level.image
-    response, slope = _responses(image)
-    peak = cv2.dilate(response, np.ones((3, 3), dtype=np.uint8))
+    response, smoothed = _responses(image)
+    peak = np.asarray(cv2.dilate(response, np.ones((3, 3), dtype=np.uint8)))
     least = max(LEAST_RESPONSE, LEAST_RESPONSE_NOISE * noise_level(image))
     margin = HALF_WIDTH_PX
-    candidates = cv2.compare(response, peak, cv2.CMP_GE) & cv2.compare(response, least, cv2.CMP_GT)
-    candidates[:margin] = candidates[-margin:] = 0
-    candidates[:, :margin] = candidates[:, -margin:] = 0
-    at = cv2.findNonZero(candidates)
-    if at is None:
+    inner = slice(margin, -margin)
+    v, u = np.nonzero((response >= np.maximum(peak, least))[inner, inner])
+    u, v = u + margin, v + margin
+    if not len(u):
         return np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0)
-    u, v = at.reshape(-1, 2).T
     strength = response[v, u].astype(float)
     if len(u) > MOST_RESPONSES:
         strongest = np.argpartition(-strength, MOST_RESPONSES)[:MOST_RESPONSES]
         u, v, strength = u[strongest], v[strongest], strength[strongest]
-    place = np.stack([u, v], axis=1) + _to_minimum(slope, u, v)
+    place = np.stack([u, v], axis=1) + _to_minimum(smoothed, u, v)
     axes, crossing = _arms(image, place)
     scale = level.reduction
     return place[crossing] * scale + (scale - 1) / 2, axes[crossing], strength[crossing]
@@ -117,15 +115,15 @@ def _responses(image: Image) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     second -= second.mean()
     second *= 2 / (second * x**2).sum()
     first /= -(first * x).sum()
-    smoothed = np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, smooth, smooth))
-    xx = cv2.sepFilter2D(image, cv2.CV_32F, second, smooth)
-    yy = cv2.sepFilter2D(image, cv2.CV_32F, smooth, second)
-    xy = cv2.sepFilter2D(image, cv2.CV_32F, first, first)
-    both = cv2.max(xx, 0)
-    cv2.multiply(both, cv2.max(yy, 0), dst=both)
-    cv2.multiply(xy, xy, dst=xy)
-    cv2.subtract(both, xy, dst=both)
-    return np.asarray(cv2.sqrt(cv2.max(both, 0))), smoothed
+
+    def filtered(across: Array, down: Array) -> NDArray[np.float32]:
+        return np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, across, down), dtype=np.float32)
+
+    xx, yy, xy = np.maximum(filtered(second, smooth), 0), np.maximum(filtered(smooth, second), 0), filtered(first, first)
+    np.multiply(xx, yy, out=xx)
+    np.multiply(xy, xy, out=xy)
+    np.subtract(xx, xy, out=xx)
+    return np.sqrt(np.maximum(xx, 0, out=xx), out=xx), filtered(smooth, smooth)
 
 
 def _to_minimum(smoothed: NDArray[np.float32], u: NDArray[Any], v: NDArray[Any]) -> Array:
