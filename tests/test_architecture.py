@@ -29,7 +29,8 @@ ORDER = [
     # shapes in which deformations are spoken of
     *("surface.zernike",),
     # what is printed
-    *("targets.pattern", "targets.symmetry", "targets.builders"),
+    *("targets.pattern", "targets.flat", "targets.gridlines", "targets.symmetry", "targets.builders"),
+    "targets.grid_builders",
     # how a printed membrane moves
     *("surface.membrane",),
     # finding it
@@ -60,7 +61,8 @@ ORDER = [
     *("difference.response", "difference.changes", "difference.priors", "difference.model", "difference.joint"),
     *("difference.estimate", "difference.difference_map", "difference.bound"),
     # photographs with truth
-    *("simulate.deform", "simulate.scene", "simulate.forward", "simulate.truth", "simulate.contour", "simulate.render"),
+    *("simulate.deform", "simulate.scene", "simulate.forward", "simulate.truth", "simulate.contour", "simulate.grid_ink"),
+    "simulate.render",
     *("simulate.scenario",),
     # all of it in one short function
     *("pipeline", "compare", "figures"),

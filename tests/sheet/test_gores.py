@@ -15,12 +15,13 @@ from scipy.spatial import cKDTree
 
 from dishmap.errors import PatternError
 from dishmap.io.pattern_file import read_pattern, write_pattern
-from dishmap.sheet.flatten import AlongMeridian, AroundVertex, meridian_mm, radius_mm
+from dishmap.sheet.flatten import AlongMeridian, AroundVertex
 from dishmap.sheet.gores import cut_targets, dish_pieces
 from dishmap.sheet.outline import inside
 from dishmap.sheet.pieces import reach_mm
 from dishmap.targets.builders import disc, dish, multi_circular
 from dishmap.targets.detect import find_ellipses
+from dishmap.targets.flat import meridian_mm, radius_mm
 from dishmap.targets.identify import identify
 from dishmap.targets.pattern import Pattern, Surface
 

@@ -18,13 +18,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dishmap.targets.flat import NEWTON_MM, NEWTON_STEPS, from_flat_mm, meridian_mm, radius_mm, ratio, to_flat_mm
+from dishmap.targets.pattern import Surface
+
 Array = NDArray[np.float64]
 
 # Runge-Kutta steps along a geodesic: right to 3e-6 mm over 100 mm on a dish of 100 mm focal length.
 STEPS = 12
-# Newton steps for the way back, and where they may end.
-NEWTON_STEPS = 12
-NEWTON_MM = 1e-9
 
 
 class FlatMap(Protocol):
@@ -69,15 +69,17 @@ class AroundVertex:
 
     focal_length_mm: float
 
+    @property
+    def _surface(self) -> Surface:
+        return Surface("paraboloid", focal_length_mm=self.focal_length_mm)
+
     def to_flat(self, xy_mm: Array) -> Array:
         """Where points of the surface lie on the paper."""
-        radius = np.hypot(*np.asarray(xy_mm, dtype=float).T)
-        return np.asarray(xy_mm * _over(meridian_mm(radius, self.focal_length_mm), radius)[:, None])
+        return to_flat_mm(self._surface, xy_mm)
 
     def to_surface(self, flat_mm: Array) -> Array:
         """Where points of the paper lie on the surface."""
-        way = np.hypot(*np.asarray(flat_mm, dtype=float).T)
-        return np.asarray(flat_mm * _over(radius_mm(way, self.focal_length_mm), way)[:, None])
+        return from_flat_mm(self._surface, flat_mm)
 
     def axes(self, flat_mm: Array) -> tuple[Array, Array]:
         """Unit vectors (N, 3) along the surface into which the paper's x and y go."""
@@ -91,7 +93,7 @@ class AroundVertex:
     def stretch(self, flat_mm: Array, reach_mm: Array) -> Array:
         """Length along the parallel over length on the paper (N,), where it is least."""
         way = np.hypot(*flat_mm.T) + reach_mm
-        return _over(radius_mm(way, self.focal_length_mm), way)
+        return ratio(radius_mm(way, self.focal_length_mm), way)
 
 
 @dataclass(frozen=True)
@@ -152,24 +154,6 @@ class AlongMeridian:
         return point, along, np.cross(_normal(point, f), along), state[6]
 
 
-def meridian_mm(radius: Array, focal_length_mm: float) -> Array:
-    """Way along a meridian of a paraboloid from the vertex to a distance from the axis (N,), both in mm."""
-    x = np.asarray(radius, dtype=float) / (2 * focal_length_mm)
-    return np.asarray(focal_length_mm * (x * np.hypot(1, x) + np.arcsinh(x)))
-
-
-def radius_mm(way: Array, focal_length_mm: float) -> Array:
-    """Distance from the axis at a way along a meridian from the vertex (N,), both in mm: the inverse of `meridian_mm`."""
-    way = np.asarray(way, dtype=float)
-    radius = way / np.sqrt(1 + np.abs(way) / (4 * focal_length_mm))
-    for _ in range(NEWTON_STEPS):
-        step = (way - meridian_mm(radius, focal_length_mm)) / np.hypot(1, radius / (2 * focal_length_mm))
-        radius = radius + step
-        if np.abs(step).max(initial=0.0) < NEWTON_MM:
-            break
-    return radius
-
-
 def _change(state: Array, f: float) -> Array:
     """Derivative of (point, direction, j, j') (8, N) along a geodesic: it bends with the surface only, p'' = II(p', p') n."""
     x, y, _, vx, vy, vz, ratio, slope = state
@@ -182,8 +166,3 @@ def _change(state: Array, f: float) -> Array:
 def _normal(point: Array, f: float) -> Array:
     normal = np.column_stack([-point[:, :2] / (2 * f), np.ones(len(point))])
     return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
-
-
-def _over(a: Array, b: Array) -> Array:
-    """The ratio of two lengths, and 1 where both vanish."""
-    return np.asarray(np.where(b > 0, a / np.where(b > 0, b, 1.0), 1.0))

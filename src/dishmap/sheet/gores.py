@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.errors import PatternError
-from dishmap.sheet.flatten import AlongMeridian, AroundVertex, meridian_mm, radius_mm
+from dishmap.sheet.flatten import AlongMeridian, AroundVertex
 from dishmap.sheet.pieces import Piece, flat_piece, reach_mm
 from dishmap.sheet.seams import CLEARANCE_MM, ROOM, ROW_MM, Ground, Seams, find_seams
 from dishmap.sheet.shapes import Line
+from dishmap.targets.flat import meridian_mm, radius_mm
 from dishmap.targets.pattern import Pattern
 
 Array = NDArray[np.float64]

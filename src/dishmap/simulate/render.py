@@ -1,7 +1,8 @@
 """Photographs with truth: `simulate(scene, rng)`.
 
-Every printed circle is followed through the bent surface, the pose and the lens, and its coverage of each pixel is
-computed exactly (`contour`). Regions are put together as light, shaded, and only then recorded: gamma, noise, rounding.
+Every printed circle, polygon and line is followed through the bent surface, the pose and the lens, and its coverage of each
+pixel is computed exactly (`contour`, `grid_ink`). Regions are put together as light, shaded, and only then recorded: gamma,
+noise, rounding.
 """
 
 from __future__ import annotations
@@ -14,9 +15,21 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 
-from dishmap.simulate.contour import STEP_SIGMAS, add_curve, circle, finish, polyline, reach_px, signed_area, spectral_dv
-from dishmap.simulate.forward import facing, outline_px, printed_points, rib_outlines_px
-from dishmap.simulate.scene import FULL_SCALE_GREY, Disc, Scene, Sensor, Shape, spread_radius_mm
+from dishmap.simulate.contour import (
+    STEP_SIGMAS,
+    add_curve,
+    circle,
+    finish,
+    panel_nodes,
+    polyline,
+    reach_px,
+    signed_area,
+    smooth_pieces,
+    spectral_dv,
+)
+from dishmap.simulate.forward import facing, outline_px, print_facing, printed_points, rib_outlines_px
+from dishmap.simulate.grid_ink import HALVINGS, crossing_ink, line_curves
+from dishmap.simulate.scene import FULL_SCALE_GREY, Disc, Scene, Sensor, Shape, spread_corners_mm, spread_radius_mm
 from dishmap.simulate.truth import Simulation, Truth, truth_of
 
 Array = NDArray[np.float64]
@@ -74,7 +87,22 @@ def render_light(scene: Scene) -> tuple[Grey, Truth]:
         clear = ink.patch.of(light) < FULL_SCALE_GREY
         open_ = clear if hidden is None else clear * (1 - ink.patch.of(hidden))
         visible[ink.index] = np.clip((ink.patch.coverage * open_).sum(dtype=float) / ink.whole_px2, 0.0, 1.0)
+    if scene.pattern.lines:
+        visible = _crossings_visible(scene, light, hidden)
+    # of a square beyond the edge of sight some ink may show, but not what its truth is about
+    visible[~facing(scene)] = 0.0
     return light, truth_of(scene, visible)
+
+
+def _crossings_visible(scene: Scene, light: Grey, hidden: Grey | None) -> Array:
+    """Share (N,) of the lines' ink within half a step of each crossing that is printed, in the image, not hidden and not saturated."""
+    px, seen = crossing_ink(scene)
+    height, width = light.shape
+    u, v = np.moveaxis(np.rint(np.where(seen[..., None], px, -1.0)).astype(np.int64), -1, 0)
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    u, v = np.where(inside, u, 0), np.where(inside, v, 0)
+    open_ = inside & (light[v, u] < FULL_SCALE_GREY)
+    return np.asarray((open_ if hidden is None else open_ * (1.0 - hidden[v, u])).mean(axis=1))
 
 
 def record(light: Grey, sensor: Sensor, rng: Generator) -> NDArray[np.uint8] | NDArray[np.uint16]:
@@ -97,33 +125,50 @@ def record(light: Grey, sensor: Sensor, rng: Generator) -> NDArray[np.uint8] | N
 
 
 def _print(light: Grey, scene: Scene) -> list[Ink]:
-    """Paint the surface and its targets over the background, and return the targets' ink as far as it is in the image."""
+    """Paint the surface, its targets and lines over the background, and return the targets' own ink as far as it is in the image."""
     surface = _surface(scene)
     _paint(light, Patch(0, 0, surface), scene.light.ground_grey)
-    inks = [ink for index in np.flatnonzero(facing(scene)) if (ink := _ink(scene, int(index))) is not None]
-    for ink in inks:
+    inks = [ink for index in _drawn(scene) if (ink := _ink(scene, index)) is not None]
+    patches = [ink.patch for ink in inks]
+    if scene.pattern.lines:
+        patches.append(Patch(0, 0, _coverage(scene, *line_curves(scene))))
+    for patch in patches:
         # ink is part of the surface: where the rim hides the surface there is none
-        np.minimum(ink.patch.coverage, ink.patch.of(surface), out=ink.patch.coverage)
-        ink.patch.of(light)[...] += ink.patch.coverage * np.float32(scene.light.ink_grey - scene.light.ground_grey)
+        np.minimum(patch.coverage, patch.of(surface), out=patch.coverage)
+        patch.of(light)[...] += patch.coverage * np.float32(scene.light.ink_grey - scene.light.ground_grey)
     return inks
+
+
+def _drawn(scene: Scene) -> list[int]:
+    """Targets with ink of their own that may be seen; of polygons a part may be, whichever way the target's middle faces."""
+    kinds = [scene.pattern.kind_of(index) for index in range(len(scene.pattern))]
+    shown = facing(scene)
+    return [index for index, kind in enumerate(kinds) if kind.polygons or (shown[index] and len(kind.radius_mm))]
 
 
 def _surface(scene: Scene) -> Grey:
     """Coverage (height, width) by the whole surface, nothing where its back is seen."""
     outline, dv = polyline(outline_px(scene), scene.sensor.psf_sigma_px)
+    # the pattern's front has its y against the image's v: its outline has negative area
+    return _coverage(scene, outline, -dv)
+
+
+def _coverage(scene: Scene, points_px: Array, dv_px: Array) -> Grey:
+    """Coverage (height, width) of the whole image by the region inside closed curves."""
     height, width = scene.camera.height_px, scene.camera.width_px
-    surface = np.empty((height, width), dtype=np.float32)
+    image = np.empty((height, width), dtype=np.float32)
     for start in range(0, height, ROWS_PER_BAND):
         band = np.zeros((min(ROWS_PER_BAND, height - start), width))
-        # the pattern's front has its y against the image's v: its outline has negative area
-        add_curve(band, (0, start), outline, -dv, scene.sensor.psf_sigma_px)
-        surface[start : start + ROWS_PER_BAND] = np.clip(finish(band), 0.0, 1.0)
-    return surface
+        add_curve(band, (0, start), points_px, dv_px, scene.sensor.psf_sigma_px)
+        image[start : start + ROWS_PER_BAND] = np.clip(finish(band), 0.0, 1.0)
+    return image
 
 
 def _ink(scene: Scene, index: int) -> Ink | None:
     """Exact coverage by one target's ink; None if it is outside the image or leaves the lens's field."""
     kind, sigma = scene.pattern.kind_of(index), scene.sensor.psf_sigma_px
+    if kind.polygons:
+        return _polygon_ink(scene, index)
     radius = spread_radius_mm(kind.radius_mm, kind.dark, scene.ink_spread_mm)
     coarse = _circles_px(scene, index, kind.center_mm, radius, CIRCLE_COARSE)
     if not np.isfinite(coarse).all():
@@ -137,6 +182,42 @@ def _ink(scene: Scene, index: int) -> Ink | None:
     points = points.reshape(-1, 2)
     patch = _region(points, (sign[:, None] * dv).reshape(-1), (scene.camera.height_px, scene.camera.width_px), sigma)
     return None if patch is None else Ink(index, patch, float((sign * area).sum()))
+
+
+def _polygon_ink(scene: Scene, index: int) -> Ink | None:
+    """`_ink` of a target made of polygons."""
+    sides, sign = [], []
+    for polygon in scene.pattern.kind_of(index).polygons:
+        corners = _facing_part(scene, index, spread_corners_mm(polygon, scene.ink_spread_mm))
+        ahead = np.roll(corners, -1, axis=0) - corners
+        sides.append(corners[:, None] + panel_nodes()[:, None] * ahead[:, None])
+        sign += [1.0 if polygon.dark else -1.0] * len(corners)
+    pieces = scene.camera.project(printed_points(scene, index, np.concatenate(sides)))
+    if not len(pieces) or not np.isfinite(pieces).all():
+        return None
+    points, dv, piece = smooth_pieces(pieces, scene.sensor.psf_sigma_px)
+    # a printed side faces the camera with its outline turned against the image's axes
+    dv = -dv * np.array(sign)[piece]
+    patch = _region(points, dv, (scene.camera.height_px, scene.camera.width_px), scene.sensor.psf_sigma_px)
+    return None if patch is None else Ink(index, patch, float(signed_area(points - points[0], dv)))
+
+
+def _facing_part(scene: Scene, index: int, corners_mm: Array) -> Array:
+    """Corners (K, 2) of what faces the camera of a printed polygon: cut straight where the surface turns away."""
+    shown = print_facing(scene, index, corners_mm)
+    if shown.all():
+        return corners_mm
+    kept: list[Array] = []
+    for here, there, seen, seen_there in zip(corners_mm, np.roll(corners_mm, -1, axis=0), shown, np.roll(shown, -1), strict=True):
+        if seen:
+            kept.append(here)
+        if seen != seen_there:
+            low, high = (here, there) if seen else (there, here)
+            for _ in range(HALVINGS):
+                middle = 0.5 * (low + high)
+                low, high = (middle, high) if print_facing(scene, index, middle[None])[0] else (low, middle)
+            kept.append(low)
+    return np.array(kept).reshape(-1, 2)
 
 
 def _circles_px(scene: Scene, index: int, center_mm: Array, radius_mm: Array, count: int) -> Array:

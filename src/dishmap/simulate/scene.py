@@ -6,6 +6,7 @@ light: `Sensor.gamma` and the noise come after.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,7 +16,9 @@ from numpy.typing import NDArray
 from dishmap.camera.model import Camera
 from dishmap.errors import InputError
 from dishmap.simulate.deform import Deformation
+from dishmap.targets.gridlines import GridLines
 from dishmap.targets.pattern import Pattern
+from dishmap.targets.pattern import Polygon as PrintedPolygon
 from dishmap.transforms import Pose, rotation_from_vector
 
 Array = NDArray[np.float64]
@@ -123,6 +126,21 @@ class Ribs:
 
 
 @dataclass(frozen=True)
+class LineGap:
+    """Missing ink of line number `line` of a grid, from start_t to stop_t in steps of the lattice from the line's first target."""
+
+    line: int
+    start_t: float
+    stop_t: float
+
+    def __post_init__(self) -> None:
+        if self.line < 0 or not (np.isfinite([self.start_t, self.stop_t]).all() and self.start_t < self.stop_t):
+            raise InputError(
+                f"a gap needs a line's number and a start_t below its stop_t, not line {self.line} from {self.start_t} to {self.stop_t}"
+            )
+
+
+@dataclass(frozen=True)
 class Sensor:
     """Blur, tone curve, noise and quantisation.
 
@@ -154,9 +172,9 @@ class Sensor:
 class Scene:
     """One photograph to be made.
 
-    ink_spread_mm: every dark area grows by this much at its edges. margin_mm: ground beyond the outermost ink of a
-    pattern that has no rim. ribs: struts that cross the rim. background: shapes behind the dish and its ribs, painted in
-    order; occluders: shapes in front of it.
+    ink_spread_mm: every dark area grows by this much at its edges. line_gaps: where a grid's lines are broken. margin_mm: ground
+    beyond the outermost ink of a pattern that has no rim. ribs: struts that cross the rim. background: shapes behind the dish
+    and its ribs, painted in order; occluders: shapes in front of it.
     """
 
     pattern: Pattern
@@ -167,11 +185,13 @@ class Scene:
     sensor: Sensor = field(default_factory=Sensor)
     ink_spread_mm: float = 0.0
     margin_mm: float = 20.0
+    line_gaps: tuple[LineGap, ...] = ()
     ribs: tuple[Ribs, ...] = ()
     background: tuple[Shape, ...] = ()
     occluders: tuple[Shape, ...] = ()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "line_gaps", tuple(self.line_gaps))
         object.__setattr__(self, "ribs", tuple(self.ribs))
         object.__setattr__(self, "background", tuple(self.background))
         object.__setattr__(self, "occluders", tuple(self.occluders))
@@ -182,6 +202,14 @@ class Scene:
         for name, kind in self.pattern.kinds.items():
             if (spread_radius_mm(kind.radius_mm, kind.dark, self.ink_spread_mm) <= 0).any():
                 raise InputError(f"an ink spread of {self.ink_spread_mm} mm closes a circle of target kind {name!r}; make it smaller")
+            for polygon in kind.polygons:
+                spread_corners_mm(polygon, self.ink_spread_mm)
+        for line in self.pattern.lines:
+            if line.width_mm + 2 * self.ink_spread_mm <= 0:
+                raise InputError(f"an ink spread of {self.ink_spread_mm} mm closes a line of {line.width_mm} mm; make it smaller")
+        for gap in self.line_gaps:
+            if gap.line >= len(self.pattern.lines):
+                raise InputError(f"a gap is in line {gap.line}, but the pattern has {len(self.pattern.lines)} lines, counted from 0")
 
     def with_state(self, deformation: Deformation) -> Scene:
         """Return the same scene with the surface in another state."""
@@ -191,6 +219,48 @@ class Scene:
 def spread_radius_mm(radius_mm: Array, dark: NDArray[np.bool_], ink_spread_mm: float) -> Array:
     """Radii (C,) on the print: the ink's outer edges move out and its inner edges in."""
     return np.asarray(radius_mm + np.where(dark, ink_spread_mm, -ink_spread_mm))
+
+
+def spread_corners_mm(polygon: PrintedPolygon, ink_spread_mm: float) -> Array:
+    """Corners (K, 2), counter-clockwise, of a printed polygon whose sides have moved: out where its inside is ink, else in.
+
+    Raises InputError when that closes the polygon.
+    """
+    corners = polygon.corners_mm
+    if _twice_area(corners) < 0:
+        corners = corners[::-1]
+    ahead = np.roll(corners, -1, axis=0) - corners
+    length = np.linalg.norm(ahead, axis=1, keepdims=True)
+    out = np.column_stack([ahead[:, 1], -ahead[:, 0]]) / length
+    before = np.roll(out, 1, axis=0)
+    # a corner moves along both of its sides' normals at once
+    spread = ink_spread_mm if polygon.dark else -ink_spread_mm
+    moved = corners + spread * (out + before) / (1 + (out * before).sum(axis=1, keepdims=True))
+    if (((np.roll(moved, -1, axis=0) - moved) * ahead).sum(axis=1) <= 0).any():
+        raise InputError(f"an ink spread of {ink_spread_mm} mm closes a polygon of a target; make it smaller")
+    return np.asarray(moved)
+
+
+def _twice_area(corners: Array) -> float:
+    x, y = corners.T
+    return float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)))
+
+
+def random_line_gaps(rng: Generator, pattern: Pattern, share: float, length_steps: tuple[float, float] = (0.2, 0.6)) -> tuple[LineGap, ...]:
+    """Gaps in this share of all pieces of lines between neighbouring crossings, each wholly between them.
+
+    length_steps: the least and greatest length of a gap, in steps of the lattice. Raises InputError for other shares than 0 to 1.
+    """
+    if not 0 <= share <= 1 or not 0 < length_steps[0] <= length_steps[1] < 1:
+        raise InputError(f"gaps take a share from 0 to 1 of the pieces and lengths within 0 to 1 step, not {share} and {length_steps}")
+    pieces = [(line, a, b) for line, t in enumerate(GridLines(pattern).target_t) for a, b in itertools.pairwise(t.tolist())]
+    gaps = []
+    for number in sorted(rng.permutation(len(pieces))[: round(share * len(pieces))].tolist()):
+        line, first, last = pieces[number]
+        length = float(rng.uniform(*length_steps))
+        start = float(rng.uniform(first, last - length))
+        gaps.append(LineGap(line, start, start + length))
+    return tuple(gaps)
 
 
 def facing_pose(distance_mm: float, tilt_rad: float = 0.0, tilt_direction_rad: float = 0.0) -> Pose:

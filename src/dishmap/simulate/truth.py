@@ -19,7 +19,8 @@ class Truth:
 
     ids (N,); center_mm and normal (N, 3) in the camera frame, the normal on the printed side; center_px (N, 2), NaN for a
     centre outside the lens's field; visible_fraction (N,): share of the ink inside the image, not occluded and not
-    saturated; displacement_mm (N,): along the nominal normal, without expansion and rigid motion.
+    saturated; for a crossing of lines that of the ink within half a step of the lattice along both, were they unbroken;
+    displacement_mm (N,): along the nominal normal, without expansion and rigid motion.
     """
 
     ids: NDArray[np.int64]

@@ -114,8 +114,8 @@ def plate(
     kind: by default the paper's four rings. orientation_marks: see `with_orientation_marks`.
     Raises PatternError for impossible sizes, targets that overlap, and when no marks can break the symmetry.
     """
-    _check_counts(rows=rows, columns=columns)
-    _check_lengths(pitch_mm=pitch_mm)
+    check_counts(rows=rows, columns=columns)
+    check_lengths(pitch_mm=pitch_mm)
     kind = kind or multi_circular()
     row, column = np.divmod(np.arange(rows * columns), columns)
     xy = pitch_mm * np.stack([column - (columns - 1) / 2, (rows - 1) / 2 - row], axis=1)
@@ -143,7 +143,7 @@ def dish(
     half a step. x_axis points outwards along the surface. Distances are those seen along the boresight. ids run from the middle
     outwards, counter-clockwise from the x axis. Raises PatternError as `plate` does.
     """
-    _check_lengths(diameter_mm=diameter_mm, focal_length_mm=focal_length_mm, spacing_mm=spacing_mm)
+    check_lengths(diameter_mm=diameter_mm, focal_length_mm=focal_length_mm, spacing_mm=spacing_mm)
     kind = kind or multi_circular()
     surface = Surface("paraboloid", diameter_mm, focal_length_mm)
     room = diameter_mm / 2 - (kind.extent_mm if margin_mm is None else margin_mm)
@@ -153,7 +153,7 @@ def dish(
             f"no target of radius {kind.extent_mm:.4g} mm fits on a dish of {diameter_mm:g} mm at a spacing of {spacing_mm:g} mm"
         )
     counts = [1] * center_target + [int(np.floor(2 * np.pi * i + 1e-9)) for i in range(1, circles + 1)]
-    _check_counts(targets=sum(counts))
+    check_counts(targets=sum(counts))
     numbers = np.arange(len(counts)) + (not center_target)
     angle = np.concatenate([2 * np.pi * (np.arange(n) + 0.5 * (i > 0 and i % 2 == 0)) / n for i, n in zip(numbers, counts, strict=True)])
     radius = spacing_mm * np.repeat(numbers, counts).astype(float)
@@ -198,25 +198,28 @@ def with_orientation_marks(pattern: Pattern, kind_name: str, moves: Moves) -> Pa
 
 
 def _lattice_moves(rows: int, columns: int) -> Moves:
-    """Count, for a lattice, the wrong looks under the most similar turn by quarters and shift that keeps enough targets on targets."""
-    ones = np.ones((rows, columns))
+    """Count wrong looks on a whole lattice by `lattice_mismatches`."""
+    whole = np.ones((rows, columns), dtype=bool)
+    return lambda odd: lattice_mismatches(odd.reshape(rows, columns), whole, SMALLEST_OVERLAP)
 
-    def fewest(odd: Flags) -> int:
-        grid = odd.reshape(rows, columns).astype(float)
-        score = rows * columns
-        for quarter in range(4):
-            turned, whole = np.rot90(grid, quarter), np.rot90(ones, quarter)
-            # correlations over all shifts: targets on targets, odd ones there from either side, odd ones on odd ones
-            overlap, here, there, both = (
-                np.round(_correlate(a, b)) for a, b in ((ones, whole), (grid, whole), (ones, turned), (grid, turned))
-            )
-            wrong = here + there - 2 * both
-            if quarter == 0:
-                wrong[rows - 1, columns - 1] = score
-            score = min(score, int(wrong[overlap >= SMALLEST_OVERLAP * rows * columns].min(initial=score)))
-        return score
 
-    return fewest
+def lattice_mismatches(odd: Flags, present: Flags, smallest_overlap: float) -> int:
+    """Count the wrong looks under the most similar wrong turn by quarters and shift of a lattice.
+
+    odd and present (R, C): which places have the odd look, and which exist at all; only moves that keep this part of the places on places
+    count. Gives the number of places when there is no such move.
+    """
+    grid, ones = (odd & present).astype(float), present.astype(float)
+    count = score = int(present.sum())
+    for quarter in range(4):
+        turned, whole = np.rot90(grid, quarter), np.rot90(ones, quarter)
+        # correlations over all shifts: targets on targets, odd ones there from either side, odd ones on odd ones
+        overlap, here, there, both = (np.round(_correlate(a, b)) for a, b in ((ones, whole), (grid, whole), (ones, turned), (grid, turned)))
+        wrong = here + there - 2 * both
+        if quarter == 0:
+            wrong[odd.shape[0] - 1, odd.shape[1] - 1] = count
+        score = min(score, int(wrong[overlap >= max(1.0, smallest_overlap * count)].min(initial=count)))
+    return score
 
 
 def _correlate(a: Array, b: Array) -> Array:
@@ -260,13 +263,15 @@ def _check_gaps(pattern: Pattern, what: str) -> None:
         raise PatternError(f"{what} is too small: targets {first} and {second} touch; their radius is {extent:.4g} mm")
 
 
-def _check_lengths(**lengths: float) -> None:
+def check_lengths(**lengths: float) -> None:
+    """Raise PatternError for a length, by its name, that is not a positive number."""
     for name, value in lengths.items():
         if not (np.isfinite(value) and value > 0):
             raise PatternError(f"{name} must be a positive number, not {value}")
 
 
-def _check_counts(**counts: int) -> None:
+def check_counts(**counts: int) -> None:
+    """Raise PatternError for a count, by its name, below 1, or when their product is more than any pattern has."""
     for name, value in counts.items():
         if value < 1:
             raise PatternError(f"{name} must be 1 or more, not {value}")
