@@ -172,7 +172,7 @@ def _facts(calibration: Calibration, checks: Checks) -> list[tuple[str, str, str
         ("Rms residual", f"{number(calibration.rms_px)} px", f"length; {number(calibration.rms_px / np.sqrt(2))} px per coordinate"),
         ("Noise of a coordinate", f"{number(calibration.sigma_px)} px", f"sigmas enlarged {number(calibration.inflation)} times"),
         ("Coverage", f"{calibration.coverage:.0%}", "of the picture held corners"),
-        ("Board", f"{_mm(long)}x{_mm(short)} mm", f"seen {_mm(near)} to {_mm(far)} mm away"),
+        ("Board, mm", f"{_mm(long)}x{_mm(short)}", f"seen {_mm(near)} to {_mm(far)} mm away"),
     ]
     if checks.halves is not None:
         detail = f"rms where both saw corners; largest {number(checks.halves.difference.covered_max_px)} px"

@@ -50,7 +50,7 @@ def test_a_ring_board(ring_photographs: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "camera.yaml"
     done = dishmap(
         *["calibrate", *ring_photographs, "--board", "rings", "--corners", "7x5", "--square-mm", 20, "--lens", 5],
-        *["--format", "mrcal", "--format", "ros", "--out", out],
+        *["--format", "mrcal", "--format", "ros", "--working-mm", 500, "--out", out],
     )
     assert done.exit_code == 0, done.stderr
     camera = read_camera(out)
@@ -64,6 +64,10 @@ def test_a_ring_board(ring_photographs: list[Path], tmp_path: Path) -> None:
     page = out.with_suffix(".html").read_text()
     for heading in ("What to photograph next", "Expected projection error of the camera", "How well shapes are known", "Lens", "Board"):
         assert f"<h2>{heading}</h2>" in page
+    # the distance at which the user will measure, in all that is said of it
+    assert "Shapes at 500 mm are projected to" in done.stdout
+    assert "Expected error of shapes at 500 mm" in page
+    assert "the cameras from two halves of the views, at 500 mm" in page
     assert re.search(r"the scatter of \d+ refits", page)
     assert re.search(r"next: the board in ", done.stdout)
 

@@ -71,7 +71,7 @@ def test_boards_are_said_to_be_better_on_one_sheet_and_not_square(tmp_path: Path
     rings = ["board", "--kind", "rings", "--pitch-mm", 25, "--out", tmp_path]
     assert "glued of several sheets is hardly flat" in dishmap("sheet", *rings, "--grid", "12x9").stdout
     assert "glued of several sheets" not in dishmap("sheet", *rings, "--grid", "7x6").stdout
-    assert "glued of several sheets" not in dishmap("sheet", "plate", "--rows", 9, "--columns", 9, "--pitch-mm", 45, "--out", tmp_path).stdout
+    assert "glued of several sheets" not in dishmap("sheet", *PLATE, "--paper", "120x120", "--out", tmp_path).stdout
     square = dishmap("sheet", "board", "--kind", "chessboard", "--corners", "6x6", "--square-mm", 20, "--out", tmp_path).stdout
     assert "the board looks the same after a quarter turn" in square
     assert "take more corners one way" in square
