@@ -91,6 +91,21 @@ def test_a_photograph_that_was_cut_short(pictures: list[Picture], tmp_path: Path
     assert "view1.jpg as a photograph: it is cut short (the end marker of the JPEG is missing); copy it again" in said
 
 
+def test_files_that_may_not_be_read(pictures: list[Picture], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    photos = saved(tmp_path, pictures[:3])
+    photos[1].chmod(0)
+    plain = Path.read_bytes
+
+    def read_bytes(path: Path) -> bytes:
+        if path == photos[1]:  # root may read anything
+            raise PermissionError(13, "Permission denied")
+        return plain(path)
+
+    monkeypatch.setattr(Path, "read_bytes", read_bytes)
+    said = refused(dishmap("calibrate", *photos, *BOARD, "--out", tmp_path / "camera.yaml"))
+    assert "view1.png as a photograph: it cannot be read (Permission denied); check the name and its permissions" in said
+
+
 @pytest.mark.parametrize("kind", ["16 bits", "colour with alpha", "turned by EXIF"])
 def test_all_kinds_of_files_give_the_same_camera(kind: str, pictures: list[Picture], tmp_path: Path) -> None:
     if kind == "16 bits":

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-PATH = click.Path(path_type=Path)
+# Whoever reads a file says what is wrong with it, permissions too.
+PATH = click.Path(path_type=Path, readable=False)
 CAMERA_KEY, SPACECRAFT_KEY = "camera_from_dish", "spacecraft_from_camera"
 
 
