@@ -21,10 +21,13 @@ from dishmap.io.measurement_file import (
     is_measurement,
     measurement_bytes,
     parse_measurement,
+    pattern_fingerprint,
     read_measurement,
     write_measurement,
 )
 from dishmap.targets.builders import disc, plate
+from dishmap.targets.grid_builders import grid
+from dishmap.targets.pattern import Surface
 from dishmap.targets.pose import TargetPoses
 from dishmap.targets.scene_noise import NoiseModel
 from dishmap.transforms import Pose, rotation_from_vector
@@ -192,3 +195,18 @@ def test_pickled_objects_and_bombs_are_not_opened() -> None:
 def test_every_field_with_rows_has_a_column() -> None:
     alone = {"camera_from_dish", "normal_sigma_rad", "noise_model", "log_gamma", "rejected"}
     assert {field.name for field in fields(TargetPoses)} == {*WHOLE, *REAL, *alone}
+
+
+def test_fingerprints_hold_all_of_a_grid() -> None:
+    pattern = grid(8, 6, 12.0, line_width_mm=1.0, orientation_marks=True)
+    assert pattern.lattice is not None
+    others = [
+        replace(pattern, lattice=pattern.lattice + 1),
+        replace(pattern, lines=[replace(line, width_mm=1.1) for line in pattern.lines]),
+        replace(pattern, lines=[replace(line, overhang_mm=5.0) for line in pattern.lines]),
+        replace(pattern, lines=pattern.lines[::-1]),
+        replace(pattern, kinds={**pattern.kinds, "crossing-marked": pattern.kinds["crossing"]}),
+        grid(8, 6, 12.0, line_width_mm=1.0, orientation_marks=True, surface=Surface("cylinder", radius_mm=400.0), name=pattern.name),
+    ]
+    assert len({pattern_fingerprint(one) for one in [pattern, *others]}) == 7
+    assert pattern_fingerprint(grid(8, 6, 12.0, line_width_mm=1.0, orientation_marks=True)) == pattern_fingerprint(pattern)

@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 from dishmap.errors import InputError, PatternError
 from dishmap.io.pattern_file import format_pattern, parse_pattern, pattern_schema, read_pattern, write_pattern
 from dishmap.targets.builders import KIND_BUILDERS, disc, dish, plate
-from dishmap.targets.pattern import Pattern, TargetKind
+from dishmap.targets.grid_builders import grid
+from dishmap.targets.pattern import Pattern, Surface, TargetKind
 
 SCHEMA_FILE = Path(__file__).resolve().parents[2] / "docs" / "pattern.schema.json"
 # what the writer keeps of lengths and axes
@@ -40,11 +41,19 @@ def assert_same(a: Pattern, b: Pattern) -> None:
     assert a.ids.tolist() == b.ids.tolist()
     np.testing.assert_allclose(a.center_mm, b.center_mm, atol=WRITTEN_MM)
     np.testing.assert_allclose(a.axes, b.axes, atol=WRITTEN_AXIS)
+    assert (a.lattice is None) == (b.lattice is None)
+    assert a.lattice is None or (b.lattice is not None and a.lattice.tolist() == b.lattice.tolist())
+    assert [line.ids for line in a.lines] == [line.ids for line in b.lines]
+    for line, other in zip(a.lines, b.lines, strict=True):
+        assert (line.width_mm, line.overhang_mm) == pytest.approx((other.width_mm, other.overhang_mm), abs=WRITTEN_MM)
     assert list(a.kinds) == list(b.kinds)
     for name, kind in a.kinds.items():
         np.testing.assert_allclose(kind.center_mm, b.kinds[name].center_mm, atol=WRITTEN_MM)
         np.testing.assert_allclose(kind.radius_mm, b.kinds[name].radius_mm, atol=WRITTEN_MM)
         assert kind.dark.tolist() == b.kinds[name].dark.tolist()
+        assert [p.dark for p in kind.polygons] == [p.dark for p in b.kinds[name].polygons]
+        for polygon, other_polygon in zip(kind.polygons, b.kinds[name].polygons, strict=True):
+            np.testing.assert_allclose(polygon.corners_mm, other_polygon.corners_mm, atol=WRITTEN_MM)
 
 
 @pytest.mark.parametrize(("name", "count"), [("plate", 30), ("dish", 130)])
@@ -89,6 +98,24 @@ def test_any_kind_reads_back(radius: list[float], kind_name: str, name: str, spa
     kind = TargetKind(np.zeros((len(radius), 2)), np.array(radius), np.arange(len(radius)) % 2 == 0)
     pattern = dish(1500.0, focal, spacing, kind, kind_name, name=name or "dish")
     assert_same(parse_pattern(format_pattern(pattern)), pattern)
+
+
+SURFACES = [Surface(), Surface("paraboloid", 400.0, 150.0), Surface("cylinder", radius_mm=57.0), Surface("cylinder", radius_mm=-300.0)]
+
+
+@settings(max_examples=40)
+@given(
+    st.sampled_from(SURFACES), st.integers(2, 9), st.integers(2, 9), st.floats(5, 15), st.floats(0.03, 0.4), st.booleans(), st.booleans()
+)
+def test_any_grid_reads_back(surface: Surface, columns: int, rows: int, pitch: float, part: float, lines: bool, marks: bool) -> None:
+    ink = {"line_width_mm": part * pitch} if lines else {"square_mm": 2 * part * pitch}
+    pattern = grid(columns, rows, pitch, surface=surface, orientation_marks=marks and columns * rows > 30, **ink)
+    assert_same(parse_pattern(format_pattern(pattern)), pattern)
+    assert jsonschema_valid(format_pattern(pattern))
+
+
+def jsonschema_valid(text: str) -> bool:
+    return bool(pytest.importorskip("jsonschema").Draft202012Validator(pattern_schema()).is_valid(json.loads(text)))
 
 
 def test_axes_rounded_in_a_file_become_exact_rotations() -> None:
@@ -156,6 +183,7 @@ def scale(factor: float, centers: bool = True, circles: bool = True) -> Callable
     return change
 
 
+MARK = ("target_kinds", "crossing-marked", "polygons", 0)
 CIRCLE = ("target_kinds", "multi4", "circles", 1)
 
 
@@ -197,7 +225,7 @@ CIRCLE = ("target_kinds", "multi4", "circles", 1)
         (put(*CIRCLE, "inside", "dark"), "target kind 'multi4': circle 1 of a target kind has the colour of what surrounds it"),
         (put(*CIRCLE, "center_mm", [-9, -7]), None),
         (put(*CIRCLE, "center_mm", [-11, -7]), "target kind 'multi4': circles 0 and 1 of a target kind cross"),
-        (put("surface", "kind", "sphere"), "surface.kind must be 'plane' or 'paraboloid', not 'sphere'"),
+        (put("surface", "kind", "sphere"), "surface.kind must be 'plane', 'paraboloid' or 'cylinder', not 'sphere'"),
         (put("surface", {"kind": "paraboloid"}), "a paraboloid needs focal_length_mm"),
         (put("surface", "diameter_mm", -1.0), "surface.diameter_mm must be greater than 0, not -1.0"),
         (put("surface", "diameter_mm", 0.1), "outside the rim of diameter_mm 0.1"),
@@ -221,6 +249,39 @@ def test_one_sentence_for_each_mistake(tmp_path: Path, change: Callable[[dict[st
     with pytest.raises(PatternError, match=text) as caught:
         read_pattern(path)
     assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (put("targets", 3, "latice", [0, 0]), r"unknown key 'latice' in targets\[3\]; the nearest valid one is 'lattice'"),
+        (put("lines", 2, "width", 1.0), r"unknown key 'width' in lines\[2\]; the nearest valid one is 'width_mm'"),
+        (put("target_kinds", "crossing", "polygon", []), "unknown key 'polygon' in target_kinds.crossing; the nearest .* is 'polygons'"),
+        (put(*MARK, "corners", []), r"unknown key 'corners' in .*polygons\[0\]; the nearest valid one is 'corners_mm'"),
+        (put("line", []), "unknown key 'line' in the file; the nearest valid one is 'lines'"),
+        (drop("targets", 2, "lattice"), r"target 2 lacks its lattice, its place \[column, row\]"),
+        (put("targets", 2, "lattice", [0]), r"targets\[2\].lattice must have at least 2 items"),
+        (put("targets", 2, "lattice", [0.5, 1]), r"targets\[2\].lattice\[0\] must be a valid integer"),
+        (put("targets", 1, "lattice", [0, 5]), r"two targets have the place \[0, 5\] in the lattice"),
+        (drop("lines", 0), "1 lines go through target 0; two cross at each target of a grid"),
+        (drop("lines", 0, "width_mm"), r"lines\[0\] lacks the key 'width_mm'"),
+        (put("lines", 0, "width_mm", 0.001), r"lines\[0\].width_mm .*not 0.001; lengths are in millimetres: is the file in metres\?"),
+        (put("lines", 0, "width_mm", 900.0), r"the largest line has a width of 900 mm; .*: is the file in micrometres\?"),
+        (put("lines", 0, "targets", [0, 99]), "a line goes through target 99, which the pattern does not have"),
+        (put(*MARK, "corners_mm", [[0, 0], [1, 1]]), r"polygons\[0\].corners_mm must have at least 3 items"),
+        (put(*MARK, "inside", "light"), "polygon 0 of a target kind has the colour of what surrounds it"),
+        (put("surface", {"kind": "cylinder"}), "a cylinder needs radius_mm"),
+        (put("surface", {"kind": "cylinder", "radius_mm": 20.0}), "lies beside the cylinder of radius_mm 20"),
+        (put("surface", {"kind": "cylinder", "radius_mm": 50.0}), "mm off the cylinder of radius_mm 50"),
+        (put("target_kinds", "crossing", "circles", [{"center_mm": [0, 0], "radius_mm": 1.0, "inside": "dark"}]), "or is a grid, not both"),
+    ],
+)
+def test_one_sentence_for_each_mistake_in_a_grid(change: Callable[[dict[str, Any]], None], text: str) -> None:
+    content = json.loads(format_pattern(grid(8, 6, 12.0, line_width_mm=1.0, orientation_marks=True)))
+    change(content)
+    with pytest.raises(PatternError, match=text) as caught:
+        parse_pattern(json.dumps(content))
     assert "\n" not in str(caught.value)
 
 

@@ -288,6 +288,17 @@ def test_impossible_grids(make, changes: dict, text: str) -> None:
         make(**changes)
 
 
+def squares_at(*parts: tuple[float, float, bool]) -> TargetKind:
+    """Squares along x: where, their half side, and whether they are dark."""
+    unit = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
+    return TargetKind(np.zeros((0, 2)), [], [], tuple(Polygon(half * unit + [x, 0], dark) for x, half, dark in parts))
+
+
+def test_nested_and_disjoint_polygons() -> None:
+    kind = squares_at((0.0, 4.0, True), (0.5, 2.0, False), (9.0, 1.0, True), (0.5, 1.0, True))
+    assert kind.extent_mm == pytest.approx(np.hypot(10, 1))
+
+
 @pytest.mark.parametrize(
     ("make", "text"),
     [
@@ -297,6 +308,9 @@ def test_impossible_grids(make, changes: dict, text: str) -> None:
         (lambda: GridLine((1, 2), 1.0, -1.0), "overhang_mm must lie between"),
         (lambda: Polygon([[0, 0], [1, 0]]), "three or more corners_mm"),
         (lambda: Polygon([[0, 0], [1, 0], [2, 0]]), "holds no ink"),
+        (lambda: squares_at((0.0, 4.0, False)), "polygon 0 of a target kind has the colour of what surrounds it"),
+        (lambda: squares_at((0.0, 4.0, True), (0.5, 1.0, True)), "polygon 1 of a target kind has the colour of what surrounds it"),
+        (lambda: squares_at((0.0, 4.0, True), (3.0, 4.0, False)), "polygons 0 and 1 of a target kind cross"),
         (lambda: Surface("cylinder"), "a cylinder needs radius_mm"),
         (lambda: Surface("cylinder", radius_mm=0.0), "radius_mm must not be 0"),
     ],

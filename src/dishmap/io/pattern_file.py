@@ -18,13 +18,14 @@ from pydantic_core import ErrorDetails
 
 from dishmap.errors import PatternError
 from dishmap.io.atomic import write_text
-from dishmap.targets.pattern import AXIS_TOLERANCE, LARGEST_MM, SMALLEST_RADIUS_MM, Pattern, Surface, TargetKind
+from dishmap.targets.pattern import AXIS_TOLERANCE, LARGEST_MM, SMALLEST_RADIUS_MM, GridLine, Pattern, Polygon, Surface, TargetKind
 
 FORMAT = "dishmap-pattern/1"
 # 5,000 targets take 1 MB; a file beyond this is no pattern.
 LARGEST_FILE_BYTES = 64_000_000
-# The largest printed circle of any sensible pattern lies between these; outside, the file is in metres or micrometres.
-LIKELY_RADIUS_MM = (0.1, 500.0)
+# The largest printed circle or polygon (radius) or line (width) of any sensible pattern lies between these; outside, the file is in metres
+# or micrometres.
+LIKELY_SIZE_MM = (0.1, 500.0)
 # Targets may stand off the nominal surface by this part of the pattern's size: more is a mistake in the file.
 LARGEST_STAND_OFF = 0.05
 # Normals may lean this far from those of the nominal surface (cosine): more is a wrong sign or order.
@@ -32,6 +33,7 @@ SMALLEST_COSINE = 0.5
 
 Length = Annotated[float, Field(gt=-LARGEST_MM, lt=LARGEST_MM)]
 Size = Annotated[float, Field(gt=0, lt=LARGEST_MM)]
+Place = Annotated[int, Field(gt=-(2**31), lt=2**31)]
 Direction = Annotated[list[Annotated[float, Field(ge=-1.001, le=1.001)]], Field(min_length=3, max_length=3)]
 
 
@@ -47,18 +49,30 @@ class CircleModel(_Model):
     inside: Annotated[Literal["dark", "light"], Field(description="ink or ground; nested circles alternate, outermost are dark")]
 
 
-class KindModel(_Model):
-    """A kind of target: circles that are disjoint or nested."""
+class PolygonModel(_Model):
+    """A printed polygon in its target's plane."""
 
-    circles: Annotated[list[CircleModel], Field(min_length=1, max_length=100)]
+    corners_mm: Annotated[
+        list[Annotated[list[Length], Field(min_length=2, max_length=2)]],
+        Field(min_length=3, max_length=100, description="x, y of each corner in the target's plane, in order"),
+    ]
+    inside: Annotated[Literal["dark", "light"], Field(description="ink or ground; nested polygons alternate, outermost are dark")]
+
+
+class KindModel(_Model):
+    """A kind of target: circles or polygons that are disjoint or nested; neither for a plain crossing of lines."""
+
+    circles: Annotated[list[CircleModel], Field(max_length=100)] = []
+    polygons: Annotated[list[PolygonModel], Field(max_length=100)] = []
 
 
 class SurfaceModel(_Model):
-    """The nominal surface: z = 0, or z = (x^2 + y^2) / (4 focal_length_mm)."""
+    """The nominal surface: z = 0, z = (x^2 + y^2) / (4 focal_length_mm), or a cylinder along y that touches z = 0."""
 
-    kind: Literal["plane", "paraboloid"]
+    kind: Literal["plane", "paraboloid", "cylinder"]
     diameter_mm: Annotated[Size | None, Field(description="of the rim")] = None
     focal_length_mm: Annotated[Size | None, Field(description="needed by a paraboloid")] = None
+    radius_mm: Annotated[Length | None, Field(description="needed by a cylinder: positive if it bulges towards the camera")] = None
 
 
 class TargetModel(_Model):
@@ -69,6 +83,15 @@ class TargetModel(_Model):
     center_mm: Annotated[list[Length], Field(min_length=3, max_length=3)]
     x_axis: Annotated[Direction, Field(description="unit vector of the target's own x")]
     normal: Annotated[Direction, Field(description="unit vector towards the camera's side, at right angles to x_axis")]
+    lattice: Annotated[list[Place] | None, Field(min_length=2, max_length=2, description="[column, row] in a grid, along x and y")] = None
+
+
+class LineModel(_Model):
+    """A printed line of a grid."""
+
+    targets: Annotated[list[Annotated[int, Field(ge=0, lt=2**31)]], Field(min_length=2, description="ids of its targets, in order")]
+    width_mm: Annotated[float, Field(ge=SMALLEST_RADIUS_MM, lt=LARGEST_MM)]
+    overhang_mm: Annotated[float, Field(ge=0, lt=LARGEST_MM, description="how far it goes on beyond its first and last target")] = 0.0
 
 
 class PatternModel(_Model):
@@ -79,6 +102,7 @@ class PatternModel(_Model):
     surface: SurfaceModel
     target_kinds: Annotated[dict[Annotated[str, Field(min_length=1)], KindModel], Field(min_length=1)]
     targets: Annotated[list[TargetModel], Field(min_length=1)]
+    lines: Annotated[list[LineModel], Field(description="of a grid of lines: two through each target")] = []
 
 
 def read_pattern(path: str | os.PathLike[str]) -> Pattern:
@@ -111,24 +135,44 @@ def parse_pattern(text: str, source: str = "the pattern") -> Pattern:
 def format_pattern(pattern: Pattern) -> str:
     """The text of a pattern file: one line a target, lengths to 1e-9 mm and axes to 1e-12."""
     surface: dict[str, Any] = {"kind": pattern.surface.kind}
-    for key in ("diameter_mm", "focal_length_mm"):
+    for key in ("diameter_mm", "focal_length_mm", "radius_mm"):
         if getattr(pattern.surface, key) is not None:
             surface[key] = float(getattr(pattern.surface, key))
-    kinds = []
-    for name, kind in pattern.kinds.items():
-        circles = [
-            {"center_mm": _rounded(c, 9), "radius_mm": round(float(r), 9), "inside": "dark" if dark else "light"}
-            for c, r, dark in zip(kind.center_mm, kind.radius_mm, kind.dark, strict=True)
-        ]
-        kinds.append(f"  {json.dumps(name)}: {{\n   {json.dumps('circles')}: [\n{_lines(circles, '    ')}\n   ]\n  }}")
+    kinds = [f"  {json.dumps(name)}: {_kind_text(kind)}" for name, kind in pattern.kinds.items()]
     columns = (pattern.ids, pattern.kind_names, pattern.center_mm, pattern.x_axis, pattern.normal)
-    targets = [
+    targets: list[dict[str, Any]] = [
         {"id": int(i), "kind": kind, "center_mm": _rounded(c, 9), "x_axis": _rounded(x, 12), "normal": _rounded(n, 12)}
         for i, kind, c, x, n in zip(*columns, strict=True)
     ]
+    if pattern.lattice is not None:
+        targets = [{**target, "lattice": place} for target, place in zip(targets, pattern.lattice.tolist(), strict=True)]
     head = f' "format": {json.dumps(FORMAT)},\n "name": {json.dumps(pattern.name)},\n "surface": {json.dumps(surface)},\n'
     body = ",\n".join(kinds)
-    return f'{{\n{head} "target_kinds": {{\n{body}\n }},\n "targets": [\n{_lines(targets, "  ")}\n ]\n}}\n'
+    lines = [
+        {"targets": list(line.ids), "width_mm": round(float(line.width_mm), 9), "overhang_mm": round(float(line.overhang_mm), 9)}
+        for line in pattern.lines
+    ]
+    tail = f',\n "lines": [\n{_lines(lines, "  ")}\n ]' if lines else ""
+    return f'{{\n{head} "target_kinds": {{\n{body}\n }},\n "targets": [\n{_lines(targets, "  ")}\n ]{tail}\n}}\n'
+
+
+def _kind_text(kind: TargetKind) -> str:
+    """One line a circle or polygon, under the key of what the kind is made of."""
+    rows: list[dict[str, Any]]
+    if kind.polygons:
+        key, rows = "polygons", [{"corners_mm": [_rounded(c, 9) for c in p.corners_mm], "inside": _inside(p.dark)} for p in kind.polygons]
+    elif len(kind.radius_mm):
+        key, rows = "circles", [
+            {"center_mm": _rounded(c, 9), "radius_mm": round(float(r), 9), "inside": _inside(bool(dark))}
+            for c, r, dark in zip(kind.center_mm, kind.radius_mm, kind.dark, strict=True)
+        ]
+    else:
+        return "{}"
+    return f"{{\n   {json.dumps(key)}: [\n{_lines(rows, '    ')}\n   ]\n  }}"
+
+
+def _inside(dark: bool) -> str:
+    return "dark" if dark else "light"
 
 
 def write_pattern(path: str | os.PathLike[str], pattern: Pattern) -> None:
@@ -215,8 +259,8 @@ def _model_at(loc: tuple[int | str, ...]) -> type[BaseModel]:
     if len(loc) == 1:
         return PatternModel
     if loc[0] == "target_kinds":
-        return KindModel if len(loc) == 3 else CircleModel
-    return SurfaceModel if loc[0] == "surface" else TargetModel
+        return KindModel if len(loc) == 3 else PolygonModel if loc[2] == "polygons" else CircleModel
+    return {"surface": SurfaceModel, "lines": LineModel}.get(str(loc[0]), TargetModel)
 
 
 def _place(loc: tuple[int | str, ...]) -> str:
@@ -235,22 +279,43 @@ def _short(value: Any) -> str:
 
 def _pattern(model: PatternModel) -> Pattern:
     kinds = {name: _kind(name, kind) for name, kind in model.target_kinds.items()}
-    largest = max(float(kind.radius_mm.max()) for kind in kinds.values())
-    if not LIKELY_RADIUS_MM[0] <= largest <= LIKELY_RADIUS_MM[1]:
-        unit = "metres" if largest < LIKELY_RADIUS_MM[0] else "micrometres"
-        raise PatternError(f"the largest circle has a radius of {largest:g} mm; lengths are in millimetres: is the file in {unit}?")
-    surface = Surface(model.surface.kind, model.surface.diameter_mm, model.surface.focal_length_mm)
+    largest = _check_size(kinds, model.lines)
+    surface = Surface(model.surface.kind, model.surface.diameter_mm, model.surface.focal_length_mm, model.surface.radius_mm)
     center = np.array([t.center_mm for t in model.targets])
     x_axis, normal = np.array([t.x_axis for t in model.targets]), np.array([t.normal for t in model.targets])
     names = tuple(t.kind for t in model.targets)
     x_axis, normal = _exact_axes(x_axis, normal)
     try:
-        pattern = Pattern(model.name, surface, kinds, np.array([t.id for t in model.targets]), names, center, x_axis, normal)
+        ids, lattice = np.array([t.id for t in model.targets]), _lattice(model.targets)
+        lines = tuple(GridLine(tuple(line.targets), line.width_mm, line.overhang_mm) for line in model.lines)
+        pattern = Pattern(model.name, surface, kinds, ids, names, center, x_axis, normal, lattice, lines)
     except PatternError as error:
         small = np.ptp(center, axis=0).max() < largest and len(center) > 1 and "on top of" in str(error)
         raise PatternError(f"{error}{'; are the targets really in millimetres?' if small else ''}") from error
     _check_on_surface(pattern)
     return pattern
+
+
+def _check_size(kinds: dict[str, TargetKind], lines: list[LineModel]) -> float:
+    """The greatest size of what is printed at one place. Raises PatternError when it must be in another unit."""
+    sizes = [(float(kind.radius_mm.max()), "circle has a radius") for kind in kinds.values() if len(kind.radius_mm)]
+    sizes += [(kind.extent_mm, "polygon has a radius") for kind in kinds.values() if kind.polygons]
+    sizes += [(line.width_mm, "line has a width") for line in lines]
+    largest, what = max(sizes, default=(LIKELY_SIZE_MM[0], ""))
+    if not LIKELY_SIZE_MM[0] <= largest <= LIKELY_SIZE_MM[1]:
+        unit = "metres" if largest < LIKELY_SIZE_MM[0] else "micrometres"
+        raise PatternError(f"the largest {what} of {largest:g} mm; lengths are in millimetres: is the file in {unit}?")
+    return largest
+
+
+def _lattice(targets: list[TargetModel]) -> NDArray[np.int64] | None:
+    """Places (N, 2) of the targets of a grid, None when no target has one. Raises PatternError when only some have."""
+    without = [t.id for t in targets if t.lattice is None]
+    if len(without) == len(targets):
+        return None
+    if without:
+        raise PatternError(f"target {without[0]} lacks its lattice, its place [column, row]; give one to all targets of a grid")
+    return np.array([t.lattice for t in targets])
 
 
 def _exact_axes(x_axis: NDArray[np.float64], normal: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -270,6 +335,7 @@ def _kind(name: str, model: KindModel) -> TargetKind:
             np.array([c.center_mm for c in circles]),
             np.array([c.radius_mm for c in circles]),
             np.array([c.inside == "dark" for c in circles]),
+            tuple(Polygon(np.array(p.corners_mm), p.inside == "dark") for p in model.polygons),
         )
     except PatternError as error:
         raise PatternError(f"target kind {name!r}: {error}") from error
@@ -283,14 +349,21 @@ def _check_on_surface(pattern: Pattern) -> None:
         worst = int(np.argmax(rho))
         _refuse(pattern, worst, f"lies {rho[worst]:.6g} mm from the axis, outside the rim of diameter_mm {surface.diameter_mm:g}")
     off = np.abs(center[:, 2] - surface.height_mm(center[:, :2]))
+    if np.isnan(off).any():
+        _refuse(pattern, int(np.argmax(np.isnan(off))), f"lies beside {_surface_words(surface)}")
     size = float(np.ptp(center, axis=0).max()) + max(kind.extent_mm for kind in pattern.kinds.values())
     if off.max() > LARGEST_STAND_OFF * size:
         worst = int(np.argmax(off))
-        said = "the plane z = 0" if surface.kind == "plane" else f"the paraboloid of focal_length_mm {surface.focal_length_mm:g}"
-        _refuse(pattern, worst, f"is {off[worst]:.4g} mm off {said}")
+        _refuse(pattern, worst, f"is {off[worst]:.4g} mm off {_surface_words(surface)}")
     cosine = (pattern.normal * surface.normal(center[:, :2])).sum(axis=1)
     if cosine.min() < SMALLEST_COSINE:
         _refuse(pattern, int(np.argmin(cosine)), "has a normal that does not face as the surface does, towards the focus (z up)")
+
+
+def _surface_words(surface: Surface) -> str:
+    if surface.kind == "paraboloid":
+        return f"the paraboloid of focal_length_mm {surface.focal_length_mm:g}"
+    return "the plane z = 0" if surface.kind == "plane" else f"the cylinder of radius_mm {surface.radius_mm:g}"
 
 
 def _refuse(pattern: Pattern, index: int, why: str) -> NoReturn:

@@ -186,6 +186,21 @@ class TargetKind:
                 raise PatternError(
                     f"circle {i} of a target kind has the colour of what surrounds it; nested circles alternate, outermost are dark"
                 )
+        self._check_polygons()
+
+    def _check_polygons(self) -> None:
+        """Raise PatternError unless polygons are disjoint or nested, alternating in colour."""
+        for i, polygon in enumerate(self.polygons):
+            depth = 0
+            for j, other in enumerate(self.polygons):
+                held = _inside(polygon.corners_mm, other.corners_mm) if i != j else np.zeros(1, dtype=bool)
+                if held.any() != held.all():
+                    raise PatternError(f"polygons {min(i, j)} and {max(i, j)} of a target kind cross; they must be disjoint or nested")
+                depth += bool(held.all())
+            if polygon.dark == bool(depth % 2):
+                raise PatternError(
+                    f"polygon {i} of a target kind has the colour of what surrounds it; nested polygons alternate, outermost are dark"
+                )
 
     @cached_property
     def parent(self) -> NDArray[np.int64]:
@@ -359,6 +374,15 @@ class Pattern:
     def marks(self) -> Marks:
         """Every outermost circle with what is nested in it, over all targets: what a detector can see one by one."""
         return _marks(self)
+
+
+def _inside(points: Array, corners: Array) -> NDArray[np.bool_]:
+    """Which points (P, 2) lie inside a polygon (K, 2): a ray from each crosses its sides an odd number of times."""
+    x, y = points[:, :1], points[:, 1:]
+    (ax, ay), (bx, by) = corners.T, np.roll(corners, -1, axis=0).T
+    spans = (ay > y) != (by > y)
+    at = ax + (y - ay) * (bx - ax) / np.where(ay == by, 1.0, by - ay)
+    return np.asarray((spans & (x < at)).sum(axis=1) % 2 == 1)
 
 
 def bent_print_mm(xy_mm: Array, curvature_per_mm: Array) -> Array:
