@@ -260,7 +260,7 @@ def _model_at(loc: tuple[int | str, ...]) -> type[BaseModel]:
         return PatternModel
     if loc[0] == "target_kinds":
         return KindModel if len(loc) == 3 else PolygonModel if loc[2] == "polygons" else CircleModel
-    return {"surface": SurfaceModel, "lines": LineModel}.get(str(loc[0]), TargetModel)
+    return SurfaceModel if loc[0] == "surface" else LineModel if loc[0] == "lines" else TargetModel
 
 
 def _place(loc: tuple[int | str, ...]) -> str:
