@@ -23,9 +23,9 @@ Array = NDArray[Any]
 Single = NDArray[Any]
 Bool = NDArray[Any]
 
-# Parameters of a node, each for band 0 and 1, in lattice units; blur in px.
-OFFSET, SLOPE, BEND, HALF, INNER = slice(0, 2), slice(2, 4), slice(4, 6), slice(6, 8), slice(9, 11)
-BLUR, PLAIN, NESTED = 8, 9, 11
+# Parameters of a node, each for band 0 and 1, in lattice units; blur in px. A coarse fit of lines stops short of slopes and bends.
+OFFSET, HALF, BLUR, SLOPE, BEND, INNER = slice(0, 2), slice(2, 4), 4, slice(5, 7), slice(7, 9), slice(9, 11)
+HELD, PLAIN, NESTED = 5, 9, 11
 # Ground, its two slopes, ink.
 LIGHT = 4
 # No edge is felt beyond.
@@ -53,9 +53,10 @@ class NodeFit:
     """Result for n nodes.
 
     x (n, G): parameters; ink_share (n,): ink over ground; light (n, 4): ground, slopes, ink; normal (n, G + 4, G + 4): of the pixels
-    alone, in units of 1 / variance of the noise model; prior: precision (n, G, G); converged (n,); weight, square (n,): sums of weights and
-    of weighted squares of residuals after the step; kept, whole (n,): share of the edges' length that was used, of all and of that which
-    was looked at; residual, model, robust, cover (n, P): before the step; white (n, P): residuals after it in sigmas of the noise.
+    alone, in units of 1 / variance of the noise model; prior (n, G, G), mean (n, G): precision and mean beforehand; converged (n,);
+    weight, square (n,): sums of weights and of weighted squares of residuals after the step; kept, whole (n,): share of the edges' length
+    that was used, of all and of that which was looked at; residual, model, robust, cover (n, P): before the step; white (n, P): residuals
+    after it in sigmas of the noise.
     """
 
     x: Array
@@ -63,6 +64,7 @@ class NodeFit:
     light: Array
     normal: Array
     prior: Array
+    mean: Array
     converged: Bool
     weight: Array
     square: Array
@@ -90,15 +92,18 @@ class Weights:
 
 def _band(pixels: NodePixels, x: Array, band: int, half: Array) -> tuple[Single, Single, Single, Single]:
     """Coverage of one band (n, P), and its derivatives by offset, half width and blur."""
-    offset, slope, bend, half, blur = (
-        np.asarray(value, np.float32)[:, None] for value in (x[:, band], x[:, 2 + band], x[:, 4 + band], half, x[:, BLUR])
-    )
-    along, scale = pixels.across[1 - band], pixels.scale[band]
-    middle = along * (np.float32(0.5) * bend)
-    middle += slope
-    middle *= along
-    middle += offset
-    np.subtract(pixels.across[band], middle, out=middle)
+    scale = pixels.scale[band]
+    offset, half, blur = (np.asarray(value, np.float32)[:, None] for value in (x[:, band], half, x[:, BLUR]))
+    if x.shape[1] == HELD:
+        middle = pixels.across[band] - offset
+    else:
+        slope, bend = (np.asarray(x[:, part.start + band], np.float32)[:, None] for part in (SLOPE, BEND))
+        along = pixels.across[1 - band]
+        middle = along * (np.float32(0.5) * bend)
+        middle += slope
+        middle *= along
+        middle += offset
+        np.subtract(pixels.across[band], middle, out=middle)
     middle *= scale
     width = half * scale
     inverse = 1 / blur
@@ -163,12 +168,13 @@ def coverage(pixels: NodePixels, x: Array, crossing: bool, out: Single) -> Singl
     for k in (0, 1):
         part = 1 - bands[1 - k][0] if crossing else bands[1 - k][0]
         _, by_offset, by_half, by_blur = bands[k]
-        along = pixels.across[1 - k]
         np.multiply(by_offset, part, out=out[:, k])
-        np.multiply(out[:, k], along, out=out[:, 2 + k])
-        np.multiply(out[:, 2 + k], along, out=out[:, 4 + k])
-        out[:, 4 + k] *= np.float32(0.5)
-        np.multiply(by_half, part, out=out[:, 6 + k])
+        np.multiply(by_half, part, out=out[:, HALF.start + k])
+        if x.shape[1] > HELD:
+            along, slope, bend = pixels.across[1 - k], out[:, SLOPE.start + k], out[:, BEND.start + k]
+            np.multiply(out[:, k], along, out=slope)
+            np.multiply(slope, along, out=bend)
+            bend *= np.float32(0.5)
         by_blur *= part
         if k:
             out[:, BLUR] += by_blur
@@ -190,11 +196,11 @@ def _take_out_light(pixels: NodePixels, x: Array, cover: Single, out: Single) ->
         by_offset *= part
         out[:, k] -= by_offset
         by_offset *= along
-        out[:, 2 + k] -= by_offset
+        out[:, SLOPE.start + k] -= by_offset
         by_offset *= along
         by_offset *= np.float32(0.5)
-        out[:, 4 + k] -= by_offset
-        np.multiply(by_half, -part, out=out[:, 9 + k])
+        out[:, BEND.start + k] -= by_offset
+        np.multiply(by_half, -part, out=out[:, INNER.start + k])
         by_blur *= part
         out[:, BLUR] -= by_blur
 
@@ -215,6 +221,16 @@ def solve_light(rows: Single, weight: Single) -> Array:
     normal = sums[:, :LIGHT, :LIGHT]
     normal[:, range(LIGHT), range(LIGHT)] += 1e-6 * np.maximum(np.trace(normal, axis1=1, axis2=2), 1e-9)[:, None]
     return solve_each(normal, sums[:, :LIGHT, LIGHT:])[..., 0]
+
+
+def levels_at(pixels: NodePixels, x: Array, ink_share: Array, crossing: bool) -> tuple[Array, Single, Single]:
+    """Best light levels (n, LIGHT) at given parameters, the residuals and the coverage (n, P) there."""
+    every = np.empty((len(x), LIGHT + 1, pixels.s.shape[1]), np.float32)
+    cover = coverage(pixels, x, crossing, np.empty((len(x), x.shape[1], pixels.s.shape[1]), np.float32))
+    light_rows(pixels, cover, ink_share, every)
+    every[:, -1] = pixels.grey
+    light = solve_light(every, pixels.used.astype(np.float32))
+    return light, pixels.grey - (light[:, None].astype(np.float32) @ every[:, :-1])[:, 0], cover
 
 
 def one_step(
@@ -255,7 +271,9 @@ def one_step(
     white = every[:, -1] - (delta[:, None].astype(np.float32) @ every[:, :-1])[:, 0]
     square = np.einsum("np,np->n", white, white).astype(float)
     ratio = np.clip(light[:, 3] / np.maximum(light[:, 0], 1e-3), *INK_SHARES)
-    fields = (new, ratio, light, sums[:, :-1, :-1], priors.precision, converged, weight, square, kept.astype(float), whole.astype(float))
+    beforehand = (priors.precision, priors.mean)
+    shares = (kept.astype(float), whole.astype(float))
+    fields = (new, ratio, light, sums[:, :-1, :-1], *beforehand, converged, weight, square, *shares)
     return NodeFit(*fields, residual, model, robust, cover, white)
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from dishmap.targets.edges import monomials
 from dishmap.targets.grid_shapes import CELL, NodeShapes
 from dishmap.targets.lattice_map import BY_FIRST, BY_SECOND, DEGREE, LatticeMaps
-from dishmap.targets.window import gather
+from dishmap.targets.window import gather, places_of
 
 Array = NDArray[Any]
 # float32: enough for pixels
@@ -25,6 +25,8 @@ Bool = NDArray[Any]
 
 # A strip longer or wider than this belongs to a node that went astray.
 LONGEST_STRIP_PX, WIDEST_STRIP_PX = 600, 400
+# Offsets of the four pixels of a block, across and along a strip.
+ROW, COLUMN = (0, 1, 0, 1), (0, 0, 1, 1)
 
 
 @dataclass(frozen=True)
@@ -93,12 +95,12 @@ def node_pixels(image: NDArray[Any], maps: LatticeMaps, shapes: NodeShapes, half
     """Pixels of n nodes within `reach_px` of edges; half (n, 2): half widths in lattice units; coarse: every fourth pixel."""
     strips = strips_of(shapes, half, maps, reach_px)
     places = [_strip_places(maps, strip, reach_px, coarse) for strip in strips]
-    u, v = (np.concatenate([place[i] for place in places], axis=1) for i in (0, 1))
+    u, v, listed = (np.concatenate([place[i] for place in places], axis=1) for i in (0, 1, 2))
     scale = maps.scale_px[:, None]
     s, t = ((x - maps.origin_px[:, i : i + 1]) / scale for i, x in ((0, u), (1, v)))
     s, t = s.astype(np.float32), t.astype(np.float32)
     across, per_unit, skew = _lattice_of(maps, s, t)
-    expected = _chosen(strips, [place[0].shape[1] for place in places], across, per_unit, reach_px)
+    expected = _chosen(strips, [place[0].shape[1] for place in places], across, per_unit, reach_px) & listed
     if shapes.crossing and np.isfinite(shapes.boxes).any():
         expected &= ~_in_boxes(shapes.boxes, across, per_unit, reach_px)
     grey, inside, full = gather(image, u, v)
@@ -107,8 +109,8 @@ def node_pixels(image: NDArray[Any], maps: LatticeMaps, shapes: NodeShapes, half
     return NodePixels(across, per_unit, s, t, maps.scale_px, grey, expected, expected & inside & ~full, share, skew, bend, curve)
 
 
-def _strip_places(maps: LatticeMaps, strip: Strip, reach_px: float, coarse: bool) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Pixels u, v (n, P) that hold the strip, block by block of 2x2 neighbours; coarse: one pixel of each block."""
+def _strip_places(maps: LatticeMaps, strip: Strip, reach_px: float, coarse: bool) -> tuple[NDArray[np.int32], NDArray[np.int32], Bool]:
+    """Pixels u, v (n, P) that hold the strip, block by block of 2x2 neighbours, and which are no padding; coarse: one of each block."""
     along = np.stack([strip.start, 0.5 * (strip.start + strip.end), strip.end], axis=1)
     level = np.broadcast_to(strip.level[:, None], along.shape)
     ab = np.stack([along, level] if strip.band == 0 else [level, along], axis=-1)
@@ -123,25 +125,28 @@ def _strip_places(maps: LatticeMaps, strip: Strip, reach_px: float, coarse: bool
     sag = minor[:, 1] - minor[:, 0] - slope * (major[:, 1] - major[:, 0])
     lean = np.sqrt(1 + (np.abs(slope) + 4 * np.abs(sag / gap)) ** 2)
     across = np.linalg.norm(maps.step_px[:, :, 1 - strip.band], axis=1)
-    thick = (1.1 * strip.half * across + reach_px) * lean + np.abs(slope) + 0.5
+    thick = (1.1 * strip.half * across + reach_px) * lean + 0.5 * np.abs(slope)
     length = 2 * int(np.ceil(0.5 * (min(float((last - first).max()), LONGEST_STRIP_PX) + 1)))
     width = 2 * int(np.ceil(min(float(thick.max()), WIDEST_STRIP_PX)))
     pair = first[:, None] + np.arange(0, length, 2)
     x = (pair + 0.5 - major[:, :1]) / gap[:, None]
     middle = minor[:, :1] + slope[:, None] * (pair + 0.5 - major[:, :1]) + 4 * sag[:, None] * x * (1 - x)
     low = np.round(middle - 0.5 * (width - 1))
-    # (n, pair along, pair across, 2, 2)
+    # corners of blocks of 2x2 (n, pairs along, pairs across), and those of them that may hold pixels of the strip
     one = low[..., None] + np.arange(0, width, 2)
+    near = (np.abs(one + 0.5 - middle[..., None]) < thick[:, None, None] + 0.5) & (pair <= last[:, None])[..., None]
     two = np.broadcast_to(pair[..., None], one.shape)
     if coarse:
         # pixels of odd and even lines in turn, so that an edge along a line of pixels is not missed
         one = one + (np.arange(length // 2) % 2)[:, None]
-        one, two = (x.reshape(len(first), -1).astype(np.int32) for x in (one, two))
-    else:
-        square = (*one.shape, 2, 2)
-        one = np.broadcast_to(one[..., None, None] + np.array([0, 1]), square).reshape(len(first), -1).astype(np.int32)
-        two = np.broadcast_to(two[..., None, None] + np.array([[0], [1]]), square).reshape(len(first), -1).astype(np.int32)
-    return np.where(steep[:, None], one, two), np.where(steep[:, None], two, one)
+    block, used = places_of(near.reshape(len(first), -1))
+    one, two = (np.take_along_axis(x.reshape(len(first), -1), block, axis=1).astype(np.int32) for x in (one, two))
+    if not coarse:
+        square = (*one.shape, 4)
+        one = np.broadcast_to(one[..., None] + np.array(ROW, np.int32), square).reshape(len(first), -1)
+        two = np.broadcast_to(two[..., None] + np.array(COLUMN, np.int32), square).reshape(len(first), -1)
+        used = np.repeat(used, 4, axis=1)
+    return np.where(steep[:, None], one, two), np.where(steep[:, None], two, one), used
 
 
 def _lattice_of(maps: LatticeMaps, s: Single, t: Single) -> tuple[Single, Single, Single]:

@@ -7,7 +7,7 @@ needed: the map around a node carries lens and surface.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,8 +19,19 @@ from dishmap.quality import Quality, is_rejected, names
 from dishmap.targets.grid_fit import BLUR, HALF, LIGHT
 from dishmap.targets.grid_outcome import information_of, measured_vector
 from dishmap.targets.grid_shapes import NodeShapes, node_shapes
-from dishmap.targets.grid_stages import FARTHEST_MOVE, Stage, coarse_stage, full_stage, learn
-from dishmap.targets.lattice_map import LatticeMaps, lattice_maps, place_sigma_px
+from dishmap.targets.grid_stages import (
+    FARTHEST_MOVE,
+    FIRST_LOG_BLUR,
+    FIRST_LOG_HALF,
+    FIRST_REACH_PX,
+    Stage,
+    coarse_stage,
+    first_guess,
+    full_stage,
+    learn,
+    with_lines,
+)
+from dishmap.targets.lattice_map import LatticeMaps, lattice_maps, lines_by, place_sigma_px
 from dishmap.targets.pattern import Pattern
 from dishmap.targets.pose import (
     HIDDEN_BELOW,
@@ -114,15 +125,15 @@ def _measure(image: NDArray[Any], pattern: Pattern, shapes: NodeShapes, index: I
         raise MeasurementError("no node of the grid has neighbours in two directions; more of the grid must be seen and found")
     rejected += _named(pattern, index[~maps.known], "too few of its neighbours were found")
     index, lattice, shapes, maps = index[maps.known], lattice[maps.known], shapes.take(maps.known), maps.take(maps.known)
-    stage, noise = coarse_stage(image, maps, shapes)
+    stage, noise = coarse_stage(image, maps, shapes, first_guess(image, maps, shapes), FIRST_REACH_PX)
     learnt = learn(stage, shapes, _good(stage), noise)
     if learnt.blur_px > BLURRED_PX:
-        stage, noise = coarse_stage(image, maps, shapes, learnt.blur_px, learnt.reach_px)
+        stage, noise = coarse_stage(image, maps, shapes, replace(learnt, log_blur=FIRST_LOG_BLUR, log_half=FIRST_LOG_HALF), learnt.reach_px)
         learnt = learn(stage, shapes, _good(stage), noise)
     good = _good(stage)
     moved = measured_vector(maps, stage.x, shapes.crossing)[0][:, :2]
     moved = np.where(good[:, None], moved, maps.origin_px)
-    sigma = place_sigma_px(lattice_maps(lattice, moved, good, FIRST_SIGMA_PX), good, LEAST_SIGMA_PX)
+    sigma = place_sigma_px(lattice, moved, good, LEAST_SIGMA_PX)
     maps = lattice_maps(lattice, moved, good, sigma)
     rejected += _named(pattern, index[good & ~maps.known], "too few of its neighbours could be measured")
     rejected += [(int(pattern.ids[i]), _why_lost(stage, shapes, row)) for row, i in enumerate(index) if not good[row]]
@@ -131,8 +142,12 @@ def _measure(image: NDArray[Any], pattern: Pattern, shapes: NodeShapes, index: I
         raise MeasurementError(
             "no node of the grid could be measured: no such lines or squares are seen there; give a sharper photograph or the right pattern"
         )
-    index, shapes, maps = index[rows], shapes.take(rows), maps.take(rows)
+    index, lattice, shapes, maps = index[rows], lattice[rows], shapes.take(rows), maps.take(rows)
     stage, noise = full_stage(image, maps, shapes, stage.take(rows), learnt)
+    # lines once more by where the neighbours are now
+    places, usable = measured_vector(maps, stage.x, shapes.crossing)[0][:, :2], stage.converged & _good(stage)
+    sigma = place_sigma_px(lattice, places, usable, LEAST_SIGMA_PX)
+    stage = with_lines(stage, shapes, *lines_by(maps, lattice, places, usable, sigma))
     return _collect(image.shape, pattern, index, shapes, maps, stage, noise, sigma, rejected)
 
 

@@ -13,6 +13,7 @@ from dishmap.targets.grid_fit import (
     BEND,
     BLUR,
     HALF,
+    HELD,
     INNER,
     LIGHT,
     NESTED,
@@ -22,29 +23,35 @@ from dishmap.targets.grid_fit import (
     NodeFit,
     NodePriors,
     Weights,
+    levels_at,
     one_step,
 )
 from dishmap.targets.grid_pixels import NodePixels, node_pixels
 from dishmap.targets.grid_shapes import NodeShapes
 from dishmap.targets.lattice_map import LatticeMaps
 from dishmap.targets.scene_noise import NoiseModel, inflation_of, noise_model
-from dishmap.targets.solve import inverse_each
+from dishmap.targets.solve import inverse_each, solve_scaled
 
 Array = NDArray[Any]
 Bool = NDArray[Any]
 Index = NDArray[np.int64]
 
 # Nodes whose pixels together stay in the processor's cache.
-NODES_AT_ONCE = 48
+COARSE_AT_ONCE, FULL_AT_ONCE = 160, 48
 # Edges are felt this far, in blurs and px; what is looked at before the blur is known.
 REACH_BLURS, REACH_EXTRA_PX = 2.5, 0.5
 FIRST_BLUR_PX, FIRST_REACH_PX = 1.2, 3.5
 FIRST_LOG_BLUR, FIRST_LOG_HALF = 0.7, 0.3
 # What one node may differ from the photograph's usual blur and width at least, as a share.
 LEAST_LOG_BLUR, LEAST_LOG_HALF = 0.1, 0.1
+# Slope and bend of the level line of each band.
+LINE = (np.array([SLOPE.start, BEND.start]), np.array([SLOPE.start + 1, BEND.start + 1]))
 # A rectangle's own turn and shear, in radians or so.
 FREE_SLOPE = 0.2
-COARSE_STEPS, FULL_STEPS, FREE_STEPS = 7, 6, 2
+COARSE_STEPS, FULL_STEPS, FREE_STEPS, COARSE_ENOUGH = 7, 6, 2, 0.9
+FIRST_INK_SHARE = 0.2
+# Widths over the printed ones that are tried, at so many nodes.
+GUESS_RATIOS, GUESS_NODES = np.geomspace(0.6, 1.5, 10), 32
 CUT = (8.0, 0.1)
 ROBUST_TO_SIGMA = 1.4826
 # A node that moves farther, in lattice units, went astray.
@@ -71,9 +78,9 @@ class Learnt:
 class Stage:
     """All nodes after a stage.
 
-    x (N, G), ink_share (N,), light (N, LIGHT), normal (N, G + LIGHT, G + LIGHT), prior (N, G, G), converged, weight, square, kept, whole
-    (N,): as in NodeFit; there (N, 2, 2): arms; saturated (N,): share of pixels; brighter (N,): what differs from the model most is
-    brighter.
+    x (N, G), ink_share (N,), light (N, LIGHT), normal (N, G + LIGHT, G + LIGHT), prior (N, G, G), mean (N, G), converged, weight, square,
+    kept, whole (N,): as in NodeFit; there (N, 2, 2): arms; saturated (N,): share of pixels; brighter (N,): what differs from the model
+    most is brighter.
     """
 
     x: Array
@@ -81,6 +88,7 @@ class Stage:
     light: Array
     normal: Array
     prior: Array
+    mean: Array
     there: Bool
     converged: Bool
     weight: Array
@@ -95,16 +103,16 @@ class Stage:
         return Stage(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
 
-def chunks(maps: LatticeMaps) -> list[Index]:
+def chunks(maps: LatticeMaps, at_once: int) -> list[Index]:
     """Rows of nodes to be worked on together: those of like size in the image, so that padding wastes little."""
     order = np.argsort(np.linalg.norm(maps.step_px, axis=(1, 2)))
-    count = max(1, -(-len(order) // NODES_AT_ONCE))
+    count = max(1, -(-len(order) // at_once))
     return np.array_split(order, count)
 
 
-def priors_of(maps: LatticeMaps, shapes: NodeShapes, learnt: Learnt) -> NodePriors:
-    """Priors of n nodes: lines as their neighbours say, widths and blur as all nodes say."""
-    count, size = len(shapes.half), NESTED if shapes.inner.any() else PLAIN
+def priors_of(maps: LatticeMaps, shapes: NodeShapes, learnt: Learnt, held: bool = False) -> NodePriors:
+    """Priors of n nodes: lines as their neighbours say, widths and blur as all nodes say; held: lines run exactly as neighbours say."""
+    count, size = len(shapes.half), NESTED if shapes.inner.any() else HELD if held and shapes.crossing else PLAIN
     mean, precision = np.zeros((count, size)), np.zeros((count, size, size))
     mean[:, HALF], mean[:, BLUR] = shapes.half * learnt.half_ratio, learnt.blur_px
     diagonal = np.full((count, size), 1e-9)
@@ -114,15 +122,34 @@ def priors_of(maps: LatticeMaps, shapes: NodeShapes, learnt: Learnt) -> NodePrio
         mean[:, INNER] = shapes.inner
         diagonal[:, INNER] = (FIRST_LOG_HALF * np.where(shapes.inner > 0, shapes.inner, 1.0)) ** -2.0
     precision[:, range(size), range(size)] = diagonal
+    if size == HELD:
+        return NodePriors(mean, precision)
     along = maps.along.copy()
     if not shapes.crossing:
         along[:, :, 0] = along[:, :, :, 0] = 0.0
         along[:, :, 0, 0] = FREE_SLOPE**2
     known = inverse_each(along + 1e-14 * np.eye(2))
     for k in (0, 1):
-        slope_bend = np.array([SLOPE.start + k, BEND.start + k])
-        precision[:, slope_bend[:, None], slope_bend] = known[:, k]
+        precision[:, LINE[k][:, None], LINE[k]] = known[:, k]
     return NodePriors(mean, precision)
+
+
+def with_lines(stage: Stage, shapes: NodeShapes, mean: Array, covariance: Array) -> Stage:
+    """A stage as it would have been with other knowledge of slope and bend (`lines_by`), from its normal equations alone."""
+    size = stage.x.shape[1]
+    prior, pull = stage.prior.copy(), (stage.prior @ (stage.x - stage.mean)[..., None])[..., 0]
+    new_mean = stage.mean.copy()
+    for k in (0, 1):
+        part = BEND.start + k if not shapes.crossing else LINE[k]
+        rows = np.atleast_1d(part)
+        pick = [1] if not shapes.crossing else [0, 1]
+        prior[:, rows[:, None], rows] = inverse_each(covariance[:, k][:, pick][:, :, pick] + 1e-14 * np.eye(len(rows)))
+        new_mean[:, rows] = mean[:, k][:, pick]
+    normal = stage.normal.copy()
+    normal[:, :size, :size] += prior
+    right = np.zeros((len(stage.x), size + LIGHT))
+    right[:, :size] = pull - (prior @ (stage.x - new_mean)[..., None])[..., 0]
+    return replace(stage, x=stage.x + solve_scaled(normal, right)[:, :size], prior=prior, mean=new_mean)
 
 
 def _start(priors: NodePriors) -> Array:
@@ -131,38 +158,51 @@ def _start(priors: NodePriors) -> Array:
     return x
 
 
-def coarse_stage(
-    image: NDArray[Any], maps: LatticeMaps, shapes: NodeShapes, blur_px: float = FIRST_BLUR_PX, reach_px: float = FIRST_REACH_PX
-) -> tuple[Stage, NoiseModel]:
+def coarse_stage(image: NDArray[Any], maps: LatticeMaps, shapes: NodeShapes, first: Learnt, reach_px: float) -> tuple[Stage, NoiseModel]:
     """Fit every fourth pixel of a wide band, first all of them, then without outliers; and the noise that is left."""
-    first = Learnt(blur_px, FIRST_LOG_BLUR, np.ones(2), FIRST_LOG_HALF, NoiseModel(1.0, 0.0, 1.0))
-    rows, parts, left = chunks(maps), [], []
+    rows, parts, left = chunks(maps, COARSE_AT_ONCE), [], []
     for some in rows:
         part, fit, pixels = _coarse_chunk(image, maps.take(some), shapes.take(some), first, reach_px)
         parts.append(part)
-        good = part.converged[:, None] & (fit.robust > 0)
-        left.append((pixels.grey, fit.residual, good))
+        left.append((pixels.grey, fit.residual, part.converged[:, None] & (fit.robust > 0)))
     noise = noise_model(*([part[i] for part in left] for i in range(3)))
     stage = _together(parts, rows)
     # as many degrees of freedom as a node has parameters went into the fit
-    good = stage.converged & (stage.weight > 2 * (PLAIN + LIGHT))
-    freedom = float(np.median(stage.weight[good] / (stage.weight[good] - PLAIN - LIGHT))) if good.any() else 1.0
+    size = fit.x.shape[1] + LIGHT
+    good = stage.converged & (stage.weight > 2 * size)
+    freedom = float(np.median(stage.weight[good] / (stage.weight[good] - size))) if good.any() else 1.0
     return stage, replace(noise, base=noise.base * freedom, slope=noise.slope * freedom)
+
+
+def first_guess(image: NDArray[Any], maps: LatticeMaps, shapes: NodeShapes) -> Learnt:
+    """Widths over the printed ones that suit some of the nodes best: ink spreads, and a pattern file may be a little wrong."""
+    some = np.linspace(0, len(maps.known) - 1, min(GUESS_NODES, len(maps.known))).astype(np.int64)
+    maps, shapes = maps.take(some), shapes.take(some)
+    step = np.linalg.norm(maps.step_px, axis=1)[:, ::-1]
+    reach = FIRST_REACH_PX + (1 - GUESS_RATIOS[0]) * float(np.median(shapes.half * step))
+    pixels = node_pixels(image, maps, clear_of_ends(shapes, maps, reach), shapes.half, reach, coarse=True)
+    left = []
+    for ratio in GUESS_RATIOS:
+        guess = Learnt(FIRST_BLUR_PX, FIRST_LOG_BLUR, np.full(2, ratio), FIRST_LOG_HALF, NoiseModel(1.0, 0.0, 1.0))
+        x = _start(priors_of(maps, shapes, guess, held=True))
+        _, residual, _ = levels_at(pixels, x, np.full(len(some), FIRST_INK_SHARE), shapes.crossing)
+        left.append((guess, float(np.median((residual**2 * pixels.used).sum(axis=1)))))
+    return min(left, key=lambda guess: guess[1])[0]
 
 
 def _coarse_chunk(
     image: NDArray[Any], maps: LatticeMaps, shapes: NodeShapes, first: Learnt, reach_px: float
 ) -> tuple[Stage, NodeFit, NodePixels]:
-    priors = priors_of(maps, shapes, first)
-    x, share = _start(priors), np.full(len(shapes.half), 0.2)
+    priors = priors_of(maps, shapes, first, held=True)
+    x, share = _start(priors), np.full(len(shapes.half), FIRST_INK_SHARE)
     pixels = node_pixels(image, maps, clear_of_ends(shapes, maps, reach_px), x[:, HALF], reach_px, coarse=True)
-    unknown = Weights(1.0, 0.0, None, known=False)
+    weights = Weights(1.0, 0.0, None, known=False)
     there = np.ones((len(x), 2, 2), bool)
     if shapes.crossing:
-        fit = one_step(pixels, x, share, priors, unknown, shapes.crossing)
-        there = arms_there(pixels, fit, x, first.blur_px)
+        light, _, cover = levels_at(pixels, x, share, shapes.crossing)
+        there = arms_there(pixels, light, cover, x, first.blur_px)
         pixels = without_arms(pixels, x, there, reach_px)
-    before, weights = None, unknown
+    before = None
     for step in range(COARSE_STEPS):
         fit = one_step(pixels, x, share, priors, weights, shapes.crossing, before)
         x, share = fit.x, fit.ink_share
@@ -170,7 +210,11 @@ def _coarse_chunk(
             some = np.abs(fit.residual[fit.robust > 0])
             sigma = ROBUST_TO_SIGMA * float(np.median(some)) if len(some) else 1.0
             weights, before = Weights(max(sigma, 0.05) ** 2, 0.0, CUT), fit.robust
-            if step > FREE_STEPS and fit.converged.all():
+            if x.shape[1] == HELD:
+                # near enough for lines to find their own direction, as far as the neighbours leave it open
+                x, priors = np.pad(x, ((0, 0), (0, PLAIN - HELD))), priors_of(maps, shapes, first)
+            # the full fit goes on with the few that are left
+            if step > FREE_STEPS and fit.converged.mean() > COARSE_ENOUGH:
                 break
     return _stage(fit, there, pixels), fit, pixels
 
@@ -178,8 +222,8 @@ def _coarse_chunk(
 def _stage(fit: NodeFit, there: Bool, pixels: NodePixels) -> Stage:
     odd = np.where(pixels.used, fit.residual, 0.0)
     brighter = (odd.max(axis=1) > -odd.min(axis=1)) if odd.shape[1] else np.zeros(len(odd), bool)
-    columns = (fit.x, fit.ink_share, fit.light, fit.normal, fit.prior, there, fit.converged, fit.weight, fit.square, fit.kept, fit.whole)
-    return Stage(*columns, pixels.saturated, brighter)
+    columns = (fit.x, fit.ink_share, fit.light, fit.normal, fit.prior, fit.mean, there, fit.converged, fit.weight, fit.square)
+    return Stage(*columns, fit.kept, fit.whole, pixels.saturated, brighter)
 
 
 def _together(parts: list[Stage], rows: list[Index]) -> Stage:
@@ -202,7 +246,7 @@ def learn(stage: Stage, shapes: NodeShapes, good: Bool, noise: NoiseModel) -> Le
 
 def full_stage(image: NDArray[Any], maps: LatticeMaps, shapes: NodeShapes, coarse: Stage, learnt: Learnt) -> tuple[Stage, NoiseModel]:
     """Fit all pixels near the edges, from the coarse stage, in the maps through its places; and the noise of the photograph."""
-    rows, parts, white = chunks(maps), [], []
+    rows, parts, white = chunks(maps, FULL_AT_ONCE), [], []
     for some in rows:
         part, seen = _full_chunk(image, maps.take(some), shapes.take(some), coarse.take(some), learnt)
         parts.append(part)
@@ -221,9 +265,9 @@ def _full_chunk(
 ) -> tuple[Stage, tuple[Array, Bool]]:
     priors = priors_of(maps, shapes, learnt)
     x = _start(priors)
-    x[:, HALF.start :] = coarse.x[:, HALF.start :]
+    x[:, [*range(HALF.start, HALF.stop), BLUR]] = coarse.x[:, [*range(HALF.start, HALF.stop), BLUR]]
     if not shapes.crossing:
-        x[:, SLOPE] = coarse.x[:, SLOPE]
+        x[:, SLOPE], x[:, INNER] = coarse.x[:, SLOPE], coarse.x[:, INNER]
     pixels = node_pixels(image, maps, clear_of_ends(shapes, maps, learnt.reach_px), x[:, HALF], learnt.reach_px, coarse=False)
     if shapes.crossing:
         pixels = without_arms(pixels, x, coarse.there, learnt.reach_px)

@@ -37,6 +37,9 @@ KNOWN_PART = 0.1
 # Lattice coordinates over which the map is turned round, and nodes along each side for that.
 INVERSE_REACH, INVERSE_NODES = 0.56, 6
 OFFSETS = np.array([(i, j) for i in range(-REACH, REACH + 1) for j in range(-REACH, REACH + 1) if i or j])
+# A coefficient of the second power is half a derivative.
+DERIVATIVE = np.array([1.0, 2.0])
+SIGMA_GUESS_PX = 0.02
 # Places of a, aa and of b, bb among the monomials.
 ALONG = (
     np.array([POWERS.index((1, 0)), POWERS.index((2, 0))]),
@@ -51,8 +54,7 @@ class LatticeMaps:
     origin_px (N, 2): where (a, b) = 0; forward (N, 2, 15): coefficients of the pixel offset from there by `monomials` of a, b, without a
     constant; inverse (N, 2, 15): of a and b by monomials of s, t = (offset / scale_px); scale_px (N,).
     along (N, 2, 2, 2): covariance, for band 0 and 1, of the error of (slope, second derivative) of the level line through the node, in
-    lattice units, as far as the neighbours leave it open. known (N,): false where neighbours do not even give the steps. apart_px (N, 2):
-    where the neighbours say that the node is, from where it is; apart_factor (N,): variance of that over the places' own.
+    lattice units, as far as the neighbours leave it open. known (N,): false where neighbours do not even give the steps.
     """
 
     origin_px: Array
@@ -61,8 +63,6 @@ class LatticeMaps:
     scale_px: Array
     along: Array
     known: Bool
-    apart_px: Array
-    apart_factor: Array
 
     @property
     def step_px(self) -> Array:
@@ -84,20 +84,33 @@ class LatticeMaps:
         return LatticeMaps(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
 
+@dataclass(frozen=True)
+class _Smoothed:
+    """What neighbours say: forward (N, 2, 15) with the constant, its posterior (N, 15, 15) in steps, and the usual step (px)."""
+
+    forward: Array
+    posterior: Array
+    step_px: float
+
+
+def _smoothed(lattice: Index, place_px: Array, usable: Bool, sigma_px: float) -> _Smoothed:
+    neighbours = _neighbours(lattice, usable)
+    there = neighbours >= 0
+    step = _step_px(place_px, neighbours)
+    # nodes with the same neighbours share their matrices
+    _, first, which = np.unique(there @ (1 << np.arange(len(OFFSETS))), return_index=True, return_inverse=True)
+    gain, posterior = _gains(there[first], sigma_px / step)
+    offsets = np.where(there[..., None], place_px[neighbours] - place_px[:, None], 0.0)
+    return _Smoothed(np.swapaxes(gain[which] @ offsets, 1, 2), posterior[which], step)
+
+
 def lattice_maps(lattice: Index, place_px: Array, usable: Bool, sigma_px: float) -> LatticeMaps:
     """Maps around all nodes (N,) with lattice (N, 2) and places (N, 2), from those neighbours that are `usable` (N,).
 
     sigma_px: how well places lie on a smooth map, print and measurement together.
     """
-    neighbours = _neighbours(lattice, usable)
-    there = neighbours >= 0
-    step = _step_px(place_px, neighbours)
-    patterns, which = np.unique(there, axis=0, return_inverse=True)
-    gain, posterior = _gains(patterns, sigma_px / step)
-    offsets = np.where(there[..., None], place_px[neighbours] - place_px[:, None], 0.0)
-    forward = np.swapaxes(gain[which] @ offsets, 1, 2)
-    posterior = posterior[which]
-    apart = forward[:, :, 0].copy()
+    smoothed = _smoothed(lattice, place_px, usable, sigma_px)
+    forward, posterior, step = smoothed.forward.copy(), smoothed.posterior, smoothed.step_px
     forward[:, :, 0] = 0.0
     known = np.asarray(np.diagonal(posterior, axis1=1, axis2=2)[:, 1:3].max(axis=1) < KNOWN_PART**2)
     # a map that is not known is that of a plain lattice, so that nothing divides by zero
@@ -105,21 +118,37 @@ def lattice_maps(lattice: Index, place_px: Array, usable: Bool, sigma_px: float)
     forward[~known, 0, 1], forward[~known, 1, 2] = step, -step
     scale = 1.5 * INVERSE_REACH * np.linalg.norm(forward[:, :, 1:3], axis=1).max(axis=1)
     inverse = _inverse(forward, scale)
-    along = np.stack([posterior[:, k[:, None], k] for k in ALONG], axis=1) * step**2
-    # an error of the image of a line moves it across by its part along the other coordinate's gradient; x^2 is half a second derivative
-    gradient = np.stack([inverse[:, 1, 1:3], inverse[:, 0, 1:3]], axis=1) / scale[:, None, None]
-    twice = np.array([1.0, 2.0])
-    along = along * (gradient**2).sum(axis=2)[:, :, None, None] * twice[:, None] * twice
-    return LatticeMaps(place_px, forward, inverse, scale, along, known, apart, posterior[:, 0, 0] / (sigma_px / step) ** 2)
+    return LatticeMaps(place_px, forward, inverse, scale, _along(inverse / scale[:, None, None], smoothed), known)
 
 
-def place_sigma_px(maps: LatticeMaps, usable: Bool, least_px: float) -> float:
+def _along(inverse: Array, smoothed: _Smoothed) -> Array:
+    """`LatticeMaps.along`; inverse: by px."""
+    # an error of the image of a line moves it across by its part along the other coordinate's gradient
+    square = (inverse[:, ::-1, 1:3] ** 2).sum(axis=2)[:, :, None, None] * smoothed.step_px**2
+    return np.stack([smoothed.posterior[:, k[:, None], k] for k in ALONG], axis=1) * square * DERIVATIVE[:, None] * DERIVATIVE
+
+
+def lines_by(maps: LatticeMaps, lattice: Index, place_px: Array, usable: Bool, sigma_px: float) -> tuple[Array, Array]:
+    """What other places say of level lines, in the coordinates of `maps`.
+
+    Mean (N, 2, 2) of (slope, second derivative) of band 0 and 1, and its covariance (N, 2, 2, 2) as in `LatticeMaps.along`.
+    """
+    smoothed = _smoothed(lattice, place_px, usable, sigma_px)
+    inverse = maps.inverse / maps.scale_px[:, None, None]
+    change = smoothed.forward - maps.forward
+    mean = [np.einsum("nu,nuk->nk", inverse[:, 1 - band, 1:3], change[:, :, k]) * DERIVATIVE for band, k in enumerate(ALONG)]
+    return np.stack(mean, axis=1), _along(inverse, smoothed)
+
+
+def place_sigma_px(lattice: Index, place_px: Array, usable: Bool, least_px: float) -> float:
     """How far places stray from the smooth map through their neighbours, one standard deviation per axis."""
-    # where neighbours extrapolate they hardly say
-    good = usable & maps.known & (maps.apart_factor < 1.0)
+    smoothed = _smoothed(lattice, place_px, usable, SIGMA_GUESS_PX)
+    # the place that neighbours say has an error of its own; where they extrapolate they hardly say
+    factor = smoothed.posterior[:, 0, 0] * (smoothed.step_px / SIGMA_GUESS_PX) ** 2
+    good = usable & (factor < 1.0)
     if good.sum() < 4:
         return least_px
-    strays = maps.apart_px[good] / np.sqrt(1 + maps.apart_factor[good])[:, None]
+    strays = smoothed.forward[good, :, 0] / np.sqrt(1 + factor[good])[:, None]
     return max(float(1.4826 * np.median(np.abs(strays))), least_px)
 
 

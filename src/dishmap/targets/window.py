@@ -127,7 +127,7 @@ def _bands(image: NDArray[Any], rings: Rings, maps: LocalMaps, patches: Patches,
     dv, du = (x.ravel() for x in np.meshgrid(offsets, offsets, indexing="ij"))
     # a block is chosen by its middle
     at = _at_edges(rings, maps, patches, ring, (du + 0.5 * stride, dv + 0.5 * stride), reach)
-    block, used = (np.concatenate(values, axis=1) for values in zip(*map(_places, at), strict=True))
+    block, used = (np.concatenate(values, axis=1) for values in zip(*map(places_of, at), strict=True))
     ends = tuple(4 * int(end) for end in np.cumsum([_most(near) for near in at]))
     corners = stride * np.array([[0, 1, 0, 1], [0, 0, 1, 1]], np.int32)
     out_u, out_v = (np.take(d[:, None] + c, block, axis=0).reshape(len(block), -1) for d, c in zip((du, dv), corners, strict=True))
@@ -144,7 +144,7 @@ def _most(chosen: NDArray[Any]) -> int:
     return max(int(chosen.sum(axis=1).max(initial=0)), 1)
 
 
-def _places(chosen: NDArray[Any]) -> tuple[Index, NDArray[Any]]:
+def places_of(chosen: NDArray[Any]) -> tuple[Index, NDArray[Any]]:
     """Columns (M, n) of what is chosen in each row, and whether a column stands for anything: rows are padded to the longest."""
     used = np.arange(_most(chosen)) < chosen.sum(axis=1)[:, None]
     # what is not used points to the middle of the window
