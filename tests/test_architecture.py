@@ -50,7 +50,7 @@ ORDER = [
     # boards of circles
     *("camera.board_labels", "camera.circle_board"),
     # measuring it as the paper does, and the limit of both
-    *("targets.groups", "targets.paper", "targets.bound"),
+    *("targets.groups", "targets.paper", "targets.bound", "targets.expected"),
     # the surface through the points
     *("surface.cloud", "surface.paraboloid", "surface.fit"),
     # the difference between two photographs as the paper has it
@@ -66,6 +66,8 @@ ORDER = [
     *("simulate.scenario",),
     # all of it in one short function
     *("pipeline", "compare", "figures"),
+    # and what it would give, before there is a photograph
+    "planning",
     # paper to print
     *("sheet.shapes", "sheet.pdf", "sheet.svg", "sheet.flatten", "sheet.pieces", "sheet.seams", "sheet.gores", "sheet.markers"),
     *("sheet.boards", "sheet.outline", "sheet.paper", "sheet.tiles", "sheet.layout", "sheet.printed", "sheet.sheets"),
@@ -80,9 +82,11 @@ ORDER = [
     # and what a difference says
     *("difference_verdict", "difference_assumptions", "plot.difference", "plot.difference_photograph", "plot.difference_scene"),
     *("difference_report",),
+    # and what a plan says
+    *("planning_verdict", "planning_report", "io.plan_file"),
     # the program
     *("cli.terminal", "cli.options", "cli.prior_options", "cli.outcome", "cli.difference_outcome"),
-    *("cli.board_options", "cli.calibrate", "cli.pattern", "cli.sheet", "cli.simulate", "cli.undistort"),
+    *("cli.board_options", "cli.calibrate", "cli.pattern", "cli.sheet", "cli.plan", "cli.simulate", "cli.undistort"),
     *("cli.map", "cli.diff", "cli.demo", "cli.app", "__main__"),
 ]
 

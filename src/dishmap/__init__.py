@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from dishmap.io.pattern_file import read_pattern, write_pattern
     from dishmap.io.sheet_file import write_sheets
     from dishmap.pipeline import map_photograph
+    from dishmap.planning import Conditions, camera_of_lens, plan
     from dishmap.sheet.boards import charuco, chessboard
     from dishmap.sheet.paper import paper_of
     from dishmap.sheet.sheets import as_printed, board_sheets, pattern_sheets
@@ -53,6 +54,7 @@ _HOME = {
     "Assumptions": "dishmap.targets.stages",
     "Basis": "dishmap.surface.fit",
     "Camera": "dishmap.camera.model",
+    "Conditions": "dishmap.planning",
     "Deformation": "dishmap.simulate.deform",
     "Light": "dishmap.simulate.scene",
     "Pattern": "dishmap.targets.pattern",
@@ -68,6 +70,7 @@ _HOME = {
     "as_printed": "dishmap.sheet.sheets",
     "board_sheets": "dishmap.sheet.sheets",
     "calibrate": "dishmap.camera.calibrate",
+    "camera_of_lens": "dishmap.planning",
     "charuco": "dishmap.sheet.boards",
     "chessboard": "dishmap.sheet.boards",
     "compare_photographs": "dishmap.compare",
@@ -82,6 +85,7 @@ _HOME = {
     "track_targets": "dishmap.targets.track",
     "paper_of": "dishmap.sheet.paper",
     "pattern_sheets": "dishmap.sheet.sheets",
+    "plan": "dishmap.planning",
     "plate": "dishmap.targets.builders",
     "read_camera": "dishmap.io.camera_file",
     "read_difference": "dishmap.io.difference_file",
@@ -104,6 +108,7 @@ __all__ = [
     "Assumptions",
     "Basis",
     "Camera",
+    "Conditions",
     "Deformation",
     "Light",
     "Pattern",
@@ -120,6 +125,7 @@ __all__ = [
     "as_printed",
     "board_sheets",
     "calibrate",
+    "camera_of_lens",
     "charuco",
     "chessboard",
     "compare_photographs",
@@ -133,6 +139,7 @@ __all__ = [
     "measure_targets",
     "paper_of",
     "pattern_sheets",
+    "plan",
     "plate",
     "read_camera",
     "read_difference",

@@ -18,6 +18,7 @@ from dishmap.cli.demo import demo_command
 from dishmap.cli.diff import diff_command
 from dishmap.cli.map import map_command
 from dishmap.cli.pattern import pattern_group
+from dishmap.cli.plan import plan_group
 from dishmap.cli.sheet import sheet_group
 from dishmap.cli.simulate import simulate_command
 from dishmap.cli.undistort import undistort_command
@@ -76,6 +77,7 @@ def program() -> None:
 
 for _command in (
     pattern_group,
+    plan_group,
     sheet_group,
     calibrate_command,
     map_command,

@@ -59,9 +59,12 @@ class Numbers(click.ParamType):  # type: ignore[type-arg]  # generic in click's 
 
 
 class Grid(click.ParamType):  # type: ignore[type-arg]  # generic in click's latest versions only
-    """Two whole numbers, such as 14x19."""
+    """Two whole numbers, such as 14x19; `what` they are is said where they are refused."""
 
     name = "columnsxrows"
+
+    def __init__(self, what: str = "inner corners along the two sides") -> None:
+        self.what = what
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
         """The two numbers, or a usage error."""
@@ -69,7 +72,7 @@ class Grid(click.ParamType):  # type: ignore[type-arg]  # generic in click's lat
             return value
         parts = str(value).lower().split("x")
         if len(parts) != 2 or not all(part.isascii() and part.isdecimal() and len(part) < 7 for part in parts):
-            self.fail(f"{value!r} is not of the form 14x19 (inner corners along the two sides)", param, ctx)
+            self.fail(f"{value!r} is not of the form 14x19 ({self.what})", param, ctx)
         return int(parts[0]), int(parts[1])
 
 

@@ -10,6 +10,7 @@ import click
 
 from dishmap.cli.options import POSITIVE, F, Number, Numbers, out_file
 from dishmap.cli.terminal import say
+from dishmap.errors import InputError
 
 if TYPE_CHECKING:
     from dishmap.targets.pattern import Pattern, TargetKind
@@ -49,12 +50,9 @@ def pattern_group() -> None:
 @click.option("--columns", type=click.IntRange(1), required=True, help="Columns of targets.")
 @click.option("--pitch-mm", type=POSITIVE, required=True, help="From target to target, both ways.")
 @_kind_options
-def plate_command(rows: int, columns: int, pitch_mm: float, orientation_marks: bool, name: str, out: Path, **kind: Any) -> None:
+def plate_command(out: Path, **options: Any) -> None:
     """A flat plate of targets on a square lattice."""
-    from dishmap.targets.builders import plate
-
-    target, kind_name = kind_of(**kind)
-    _write(plate(rows, columns, pitch_mm, target, kind_name, orientation_marks, name), out)
+    _write(plate_of(**options), out)
 
 
 @pattern_group.command("dish")
@@ -64,7 +62,45 @@ def plate_command(rows: int, columns: int, pitch_mm: float, orientation_marks: b
 @click.option("--margin-mm", type=Number(), help="From the outermost targets' centres to the rim.  [default: the targets' radius]")
 @click.option("--no-center-target", is_flag=True, help="Leave the vertex free.")
 @_kind_options
-def dish_command(
+def dish_command(out: Path, **options: Any) -> None:
+    """A paraboloid with targets on concentric circles."""
+    _write(dish_of(**options), out)
+
+
+class PatternGroup(click.Group):
+    """A group whose first word is a command, or else a pattern file, which is for its command PATTERN."""
+
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
+        """The command of that name, or the one for pattern files."""
+        if args and args[0] not in self.commands and not args[0].startswith("-"):
+            return "PATTERN", self.commands["PATTERN"], args
+        return super().resolve_command(ctx, args)
+
+
+def pattern_in(file: Path, group: click.Group) -> Pattern:
+    """The pattern of a file given as first word to a PatternGroup. Raises InputError for a word that is neither file nor command."""
+    from dishmap.io.pattern_file import read_pattern
+
+    if not file.suffix and not file.exists():
+        words = ", ".join(name for name in group.commands if name != "PATTERN")
+        raise InputError(f"{str(file)!r} is neither a pattern file nor one of {words}; give one of these")
+    return read_pattern(file)
+
+
+def own_options(command: click.Command) -> list[click.Parameter]:
+    """The options that say what a pattern is, as `dishmap pattern` has them."""
+    return [option for option in command.params if option.name != "out"]
+
+
+def plate_of(rows: int, columns: int, pitch_mm: float, orientation_marks: bool, name: str, **kind: Any) -> Pattern:
+    """The plate that the options of `pattern plate` describe."""
+    from dishmap.targets.builders import plate
+
+    target, kind_name = kind_of(**kind)
+    return plate(rows, columns, pitch_mm, target, kind_name, orientation_marks, name)
+
+
+def dish_of(
     diameter_mm: float,
     focal_length_mm: float,
     spacing_mm: float,
@@ -72,15 +108,13 @@ def dish_command(
     no_center_target: bool,
     orientation_marks: bool,
     name: str,
-    out: Path,
     **kind: Any,
-) -> None:
-    """A paraboloid with targets on concentric circles."""
+) -> Pattern:
+    """The dish that the options of `pattern dish` describe."""
     from dishmap.targets.builders import dish
 
     target, kind_name = kind_of(**kind)
-    pattern = dish(diameter_mm, focal_length_mm, spacing_mm, target, kind_name, orientation_marks, margin_mm, not no_center_target, name)
-    _write(pattern, out)
+    return dish(diameter_mm, focal_length_mm, spacing_mm, target, kind_name, orientation_marks, margin_mm, not no_center_target, name)
 
 
 def kind_of(kind: str, **sizes: Any) -> tuple[TargetKind, str]:

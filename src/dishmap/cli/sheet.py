@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dishmap.cli.options import PATH, POSITIVE, F, Grid, Number, Numbers, out_folder, refuse_overwriting
-from dishmap.cli.pattern import dish_command, kind_of, plate_command
+from dishmap.cli.pattern import PatternGroup, dish_command, dish_of, own_options, pattern_in, plate_command, plate_of
 from dishmap.cli.terminal import say
-from dishmap.errors import InputError
 
 if TYPE_CHECKING:
     from dishmap.sheet.boards import CornerBoard
@@ -41,16 +40,6 @@ class Measured(click.ParamType):  # type: ignore[type-arg]  # generic in click's
         return numbers
 
 
-class SheetGroup(click.Group):
-    """A group whose first word is a command, or else a pattern file."""
-
-    def resolve_command(self, ctx: click.Context, args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
-        """The command of that name, or the one for pattern files."""
-        if args and args[0] not in self.commands and not args[0].startswith("-"):
-            return "PATTERN", self.commands["PATTERN"], args
-        return super().resolve_command(ctx, args)
-
-
 def _sheet_options(command: F) -> F:
     bars = "Lengths of the printed scale bars, to the right and upwards: writes the pattern as printed, instead of sheets."
     options = [
@@ -75,7 +64,7 @@ _strain_option = click.option(
 )
 
 
-@click.group("sheet", cls=SheetGroup, subcommand_metavar="PATTERN|plate|dish|board [OPTIONS]...")
+@click.group("sheet", cls=PatternGroup, subcommand_metavar="PATTERN|plate|dish|board [OPTIONS]...")
 def sheet_group() -> None:
     """Print a pattern or a calibration board at true scale: PDF and SVG, with the pattern file beside them."""
 
@@ -86,50 +75,25 @@ def sheet_group() -> None:
 @_sheet_options
 def file_command(pattern_file: Path, largest_strain_percent: float, out: Path, **options: Any) -> None:
     """Sheets of a pattern file."""
-    from dishmap.io.pattern_file import read_pattern
-
-    if not pattern_file.suffix and not pattern_file.exists():
-        raise InputError(f"{str(pattern_file)!r} is neither a pattern file nor one of plate, dish, board; give one of these")
+    pattern = pattern_in(pattern_file, sheet_group)
     for name in ("pattern.json", "pattern-printed.json"):
         refuse_overwriting(out / name, [pattern_file])
-    _make(read_pattern(pattern_file), out, largest_strain_percent=largest_strain_percent, **options)
+    _make(pattern, out, largest_strain_percent=largest_strain_percent, **options)
 
 
-def _own_options(command: click.Command) -> list[click.Parameter]:
-    """The options that say what a pattern is, as `dishmap pattern` has them."""
-    return [option for option in command.params if option.name != "out"]
-
-
-@sheet_group.command("plate", params=_own_options(plate_command))
+@sheet_group.command("plate", params=own_options(plate_command))
 @_sheet_options
-def plate_sheet(rows: int, columns: int, pitch_mm: float, orientation_marks: bool, name: str, out: Path, **options: Any) -> None:
+def plate_sheet(out: Path, **options: Any) -> None:
     """Sheets of a flat plate of targets."""
-    from dishmap.targets.builders import plate
-
-    target, kind_name = kind_of(**_without_sheet_options(options))
-    _make(plate(rows, columns, pitch_mm, target, kind_name, orientation_marks, name), out, **_only_sheet_options(options))
+    _make(plate_of(**_without_sheet_options(options)), out, **_only_sheet_options(options))
 
 
-@sheet_group.command("dish", params=_own_options(dish_command))
+@sheet_group.command("dish", params=own_options(dish_command))
 @_strain_option
 @_sheet_options
-def dish_sheet(
-    diameter_mm: float,
-    focal_length_mm: float,
-    spacing_mm: float,
-    margin_mm: float | None,
-    no_center_target: bool,
-    orientation_marks: bool,
-    name: str,
-    out: Path,
-    **options: Any,
-) -> None:
+def dish_sheet(out: Path, **options: Any) -> None:
     """Gores of a dish, to glue on or to cut stencils from."""
-    from dishmap.targets.builders import dish
-
-    target, kind_name = kind_of(**_without_sheet_options(options))
-    pattern = dish(diameter_mm, focal_length_mm, spacing_mm, target, kind_name, orientation_marks, margin_mm, not no_center_target, name)
-    _make(pattern, out, **_only_sheet_options(options))
+    _make(dish_of(**_without_sheet_options(options)), out, **_only_sheet_options(options))
 
 
 @sheet_group.command("board")

@@ -33,10 +33,15 @@ def change_information(
 ) -> Array:
     """Fisher information (N, 6, 6) of two equal photographs on the change of each target, its own pose and ink spread unknown."""
     one = pattern_information(camera, pattern, index, camera_from_dish, contrast_to_noise, psf_sigma_px)
+    return information_of_two(pattern, index, one, NORMAL_SIGMA_RAD, Assumptions())
+
+
+def information_of_two(pattern: Pattern, index: NDArray[np.int64], one: Array, normal_sigma_rad: float, assumptions: Assumptions) -> Array:
+    """`change_information` from that of one photograph (N, 7, 7); normal_sigma_rad: what is known of normals beforehand."""
     largest = np.array([pattern.kind_of(int(i)).radius_mm.max() for i in index])
     prior = np.zeros((len(index), 7))
-    prior[:, 3:5] = NORMAL_SIGMA_RAD**-2.0
-    prior[:, 6] = (Assumptions().ink_spread_fraction * largest) ** -2.0
+    prior[:, 3:5] = normal_sigma_rad**-2.0
+    prior[:, 6] = (assumptions.ink_spread_fraction * largest) ** -2.0
     return changed_information(one, one, prior)
 
 
@@ -58,18 +63,33 @@ def joint_bound(
     prints that stretch on their own by `strain`; camera motion free. index (N,): the targets that are seen, all by default. Raises
     InputError for an unknown way.
     """
-    if way not in WAYS:
-        raise InputError(f"unknown slide {way!r}; use one of {', '.join(WAYS)}")
     seen = np.arange(len(pattern)) if index is None else np.asarray(index, dtype=np.int64)
     information = change_information(camera, pattern, seen, camera_from_dish, contrast_to_noise, psf_sigma_px)
-    changes = blank_changes(camera, pattern, seen, camera_from_dish, information)
-    surfaces = surfaces_of(pattern, seen)
+    return shape_bound(camera, pattern, seen, camera_from_dish, information, amplitude_mm, length_mm, way, strain)
+
+
+def shape_bound(
+    camera: Camera,
+    pattern: Pattern,
+    index: NDArray[np.int64],
+    camera_from_dish: Pose,
+    information: Array,
+    amplitude_mm: float,
+    length_mm: float,
+    way: str,
+    strain: float = 0.0,
+) -> tuple[Array, Array]:
+    """`joint_bound` of targets number `index` (N,) whose changes are known with a given information (N, 6, 6)."""
+    if way not in WAYS:
+        raise InputError(f"unknown slide {way!r}; use one of {', '.join(WAYS)}")
+    changes = blank_changes(camera, pattern, index, camera_from_dish, information)
+    surfaces = surfaces_of(pattern, index)
     columns = columns_of(changes, pattern, camera, camera_from_dish, surfaces, smooth_kernel(surfaces, length_mm), way)
-    evidence = Evidence(information, changes.score, 0.0, columns, length_mm, np.zeros(0, np.int64), np.zeros(len(seen), bool))
+    evidence = Evidence(information, changes.score, 0.0, columns, length_mm, np.zeros(0, np.int64), np.zeros(len(index), bool))
     found = posterior(evidence, Sizes(amplitude_mm, 0.0, 0.0, strain))
     factor = (columns.move + columns.local_move @ found.local_by) @ found.factor
-    normal, own = pattern.normal[seen], found.local_covariance[:, 0, 0]
-    return _along(without_rigid(factor, pattern.center_mm[seen]), normal, own), _along(factor, normal, own)
+    normal, own = pattern.normal[index], found.local_covariance[:, 0, 0]
+    return _along(without_rigid(factor, pattern.center_mm[index]), normal, own), _along(factor, normal, own)
 
 
 def _along(factor: Array, normal: Array, own: Array) -> Array:

@@ -10,6 +10,8 @@ from dishmap.errors import ImageError
 from dishmap.pipeline import Map
 from dishmap.plot.photograph import Outline
 from dishmap.quality import names
+from dishmap.targets.pattern import Pattern
+from dishmap.transforms import Pose
 from dishmap.verdict import Numbers, number, rejected_targets
 
 Array = NDArray[np.float64]
@@ -36,12 +38,12 @@ def outlines_of(result: Map, numbers: Numbers) -> list[Outline]:
     place = {int(ident): i for i, ident in enumerate(result.pattern.ids.tolist())}
     nominal = result.camera.project(result.camera_from_dish.apply(result.pattern.center_mm))
     visible = result.camera.contains(nominal)
-    nominal_ellipses = _nominal_ellipses(result)
+    printed = nominal_ellipses(result.camera, result.pattern, result.camera_from_dish)
     for state, listed in (("rejected", rejected_targets(result)), ("missing", [(i, "not seen") for i in result.missing])):
         for ident, reason in listed:
             index = place[ident]
             own = ellipses[owner == index]
-            own = own if len(own) else nominal_ellipses[index][np.isfinite(nominal_ellipses[index]).all(axis=(1, 2))]
+            own = own if len(own) else printed[index]
             if visible[index]:
                 out.append(Outline(own, nominal[index], str(ident), f"target {ident}: {reason}", np.nan, state))
     return out
@@ -72,14 +74,15 @@ def _ellipses_px(result: Map, which: NDArray[np.int64]) -> Array:
     return np.stack([center, center + major[:, None] * along, center + minor[:, None] * across], axis=1)
 
 
-def _nominal_ellipses(result: Map) -> list[Array]:
-    """Where the outer circles of each target (K, 3, 2) would be seen if the surface were undeformed."""
-    marks, axes = result.pattern.marks, result.pattern.axes
+def nominal_ellipses(camera: Camera, pattern: Pattern, camera_from_dish: Pose) -> list[Array]:
+    """Where the outermost circles of each target (K, 3, 2) would be seen on the undeformed surface, but for those outside the lens."""
+    marks, axes = pattern.marks, pattern.axes
     radius = marks.radius_mm[:, None, None]
     ends = marks.center_mm[:, None] + radius * np.stack([axes[marks.target][:, :, 0], axes[marks.target][:, :, 1]], axis=1)
     three = np.concatenate([marks.center_mm[:, None], ends], axis=1)
-    pixels = result.camera.project(result.camera_from_dish.apply(three))
-    return [pixels[marks.target == i] for i in range(len(result.pattern))]
+    pixels = camera.project(camera_from_dish.apply(three))
+    seen = np.isfinite(pixels).all(axis=(1, 2))
+    return [pixels[seen & (marks.target == i)] for i in range(len(pattern))]
 
 
 def check_picture(image: NDArray[np.generic], camera: Camera) -> None:

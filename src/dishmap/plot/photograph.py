@@ -102,7 +102,9 @@ def photograph_svg(image: NDArray[np.generic], frame: Frame, outlines: list[Outl
         color = hex_colors([outline.sigma], norm)[0] if np.isfinite(outline.sigma) else BLUE
         body.append(_outline(frame, outline, color, text))
     legend = _legend(frame, norm, sigma_label) if known.size else ""
-    return _svg(frame, 0.0, LEGEND_HEIGHT if known.size else 0.0, alt, [*body, legend])
+    # an SVG of its own cuts outlines off at the picture's border
+    picture = f'<svg width="{frame.width:.1f}" height="{frame.height:.1f}">{"".join(body)}</svg>'
+    return _svg(frame, 0.0, LEGEND_HEIGHT if known.size else 0.0, alt, [picture, legend])
 
 
 def error_svg(error: ProjectionError, width_px: int, height_px: int, alt: str, image: NDArray[np.generic] | None = None) -> str:

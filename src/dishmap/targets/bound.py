@@ -7,7 +7,7 @@ length locates a straight edge of blur s to sqrt(2 sqrt(pi) s) / C px across it,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,10 +18,11 @@ from dishmap.errors import InputError
 from dishmap.targets.adjust import Batch, Priors, by_target, on_pose_and_offset, prior_terms
 from dishmap.targets.edges import Poses
 from dishmap.targets.light import light_columns
+from dishmap.targets.neighbours import Ink, clear_of_neighbours
 from dishmap.targets.pattern import Pattern, TargetKind
 from dishmap.targets.pixels import RingSums, State, coverage_columns, rings_of, without_light
 from dishmap.targets.solve import inverse_scaled
-from dishmap.targets.stages import FIRST_LOG_BLUR_SIGMA, Assumptions, Group, layout
+from dishmap.targets.stages import FIRST_LOG_BLUR_SIGMA, GROUP_SIZE, Assumptions, Group, layout, printed_ink
 from dishmap.targets.start import centers_of, nominal_poses
 from dishmap.transforms import Pose
 
@@ -71,7 +72,7 @@ def target_bound(
         raise InputError("a bound needs a positive contrast-to-noise ratio, blur and normal sigma")
     curvature = np.zeros((len(poses), 2, 2)) if curvature_per_mm is None else np.asarray(curvature_per_mm, dtype=float)
     group = _group(camera, kind, poses, curvature, psf_sigma_px, normal_sigma_rad, assumptions or Assumptions())
-    information = _information(group, float(group.state.blur_px[0])) * contrast_to_noise**2
+    information = group_information(group, contrast_to_noise)
     precision, _ = prior_terms(poses, group.state, group.batch.priors)
     covariance = inverse_scaled(information + precision[:, :, None] * np.eye(precision.shape[1]))[:, :6, :6]
     _, by_pose = centers_of(camera, poses, curvature)
@@ -85,23 +86,44 @@ def target_bound(
 
 
 def pattern_information(
-    camera: Camera, pattern: Pattern, index: NDArray[np.int64], camera_from_dish: Pose, contrast_to_noise: float, psf_sigma_px: float
+    camera: Camera,
+    pattern: Pattern,
+    index: NDArray[np.int64],
+    camera_from_dish: Pose,
+    contrast_to_noise: float,
+    psf_sigma_px: float,
+    assumptions: Assumptions | None = None,
 ) -> Array:
     """Fisher information (N, 7, 7) on (move along camera axes in mm, turn about target axes in rad, edge offset in mm) of targets.
 
     The targets number `index` (N,) lie where the undeformed pattern puts them; light, blur, tone and blooming are unknown.
     """
     out = np.zeros((len(index), 7, 7))
+    groups = pattern_groups(camera, pattern, index, camera_from_dish, psf_sigma_px, assumptions or Assumptions())
+    ink = printed_ink(camera, pattern, groups, camera_from_dish)
+    for group in groups:
+        precision, _ = prior_terms(group.poses, group.state, group.batch.priors)
+        full = group_information(group, contrast_to_noise, ink)
+        out[np.searchsorted(index, group.index)], _ = on_pose_and_offset(full, precision, group.poses.steps)
+    return out
+
+
+def pattern_groups(
+    camera: Camera, pattern: Pattern, index: NDArray[np.int64], camera_from_dish: Pose, psf_sigma_px: float, assumptions: Assumptions
+) -> list[Group]:
+    """Targets number `index` (rising) where the undeformed pattern puts them, in groups of one kind and similar distance."""
+    groups: list[Group] = []
     names = np.array(pattern.kind_names)[index]
     for name in np.unique(names):
-        rows = np.flatnonzero(names == name)
-        poses = nominal_poses(pattern, index[rows], camera_from_dish)
-        curvature = pattern.curvature_per_mm[index[rows]]
-        group = _group(camera, pattern.kinds[str(name)], poses, curvature, psf_sigma_px, FREE_NORMAL_SIGMA_RAD, Assumptions())
-        full = _information(group, float(group.state.blur_px[0])) * contrast_to_noise**2
-        precision, _ = prior_terms(poses, group.state, group.batch.priors)
-        out[rows], _ = on_pose_and_offset(full, precision, poses.steps)
-    return out
+        mine = index[names == name]
+        poses = nominal_poses(pattern, mine, camera_from_dish)
+        order = np.argsort(np.linalg.norm(poses.position_mm, axis=1), kind="stable")
+        for part in np.array_split(order, -(-len(order) // GROUP_SIZE)):
+            curvature = pattern.curvature_per_mm[mine[part]]
+            kind = pattern.kinds[str(name)]
+            group = _group(camera, kind, poses.take(part), curvature, psf_sigma_px, FREE_NORMAL_SIGMA_RAD, assumptions)
+            groups.append(replace(group, index=mine[part]))
+    return groups
 
 
 def pattern_bound(camera: Camera, pattern: Pattern, poses: Poses, contrast_to_noise: float, psf_sigma_px: float) -> Bound:
@@ -138,11 +160,16 @@ def _group(
     return Group(kind, np.arange(count), poses, Batch(camera, curvature, rings_of(kind), priors), state)
 
 
-def _information(group: Group, blur_px: float) -> Array:
-    """Fisher information (T, G, G) of the geometry for a contrast and noise of 1, light levels eliminated."""
-    camera = group.batch.camera
+def group_information(group: Group, contrast_to_noise: float, ink: Ink | None = None) -> Array:
+    """Fisher information (T, G, G) of the geometry of a group's targets, light levels eliminated, priors not counted.
+
+    ink: of the whole picture, beside which pixels are left out as the fit leaves them out; none by default.
+    """
+    camera, blur = group.batch.camera, group.state.blur_px
     blank = np.zeros((camera.height_px, camera.width_px), np.uint8)
-    batch, pixels = layout(blank, group, blur_px, blur_px)
+    batch, pixels = layout(blank, group, float(blur[0]), float(blur[0]))
+    if ink is not None:
+        pixels = clear_of_neighbours(pixels, group.index, ink, blur)
     maps = batch.maps(group.poses, pixels.patches)
     rows = slice(0, len(pixels.ring))
     cover, geometry, _ = coverage_columns(rows, pixels, batch.rings, maps, group.state)
@@ -150,4 +177,4 @@ def _information(group: Group, blur_px: float) -> Array:
     normal = (every @ np.swapaxes(every, 1, 2)).astype(float)
     empty = np.zeros(len(normal))
     sums = RingSums(normal, np.zeros(normal.shape[:2]), empty, empty, empty, empty)
-    return by_target(without_light(sums)[0], pixels.target, len(group.poses))
+    return by_target(without_light(sums)[0], pixels.target, len(group.poses)) * contrast_to_noise**2

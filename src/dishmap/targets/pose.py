@@ -43,6 +43,7 @@ from dishmap.targets.stages import (
     wholly_inside,
 )
 from dishmap.targets.start import centers_of
+from dishmap.targets.window import minor_radius_px
 from dishmap.transforms import Pose
 
 Array = NDArray[Any]
@@ -348,8 +349,7 @@ def _quality(
     least = np.maximum(LEAST_CONTRAST_SIGMAS * columns["noise"], LEAST_CONTRAST_PART * ground)
     flag(columns["contrast"] < least, Quality.NO_CONTRAST)
     flag(adjusted.noise_variance > POOR_FIT_RATIO, Quality.POOR_FIT)
-    across = np.linalg.norm(outlines - outlines.mean(axis=2, keepdims=True), axis=3).min(axis=2)
-    flag((across < SMALLEST_RADIUS_PX).any(axis=1), Quality.TOO_SMALL)
+    flag(minor_radius_px(outlines).min(axis=1) < SMALLEST_RADIUS_PX, Quality.TOO_SMALL)
     bright, lost = _lost_edges(adjusted, pixels, count)
     dropped = np.bincount(pixels.target[~pixels.used.any(axis=1)], minlength=count) > 0
     flag(lost & bright, Quality.GLARE)
@@ -358,11 +358,16 @@ def _quality(
     flag((lost & ~bright) | dropped, Quality.OCCLUDED)
     if group.ambiguous is not None:
         flag(group.ambiguous, Quality.AMBIGUOUS_NORMAL)
+    flag(rests_on_offset(information), Quality.WEAK_DEPTH)
+    return bits
+
+
+def rests_on_offset(information: Array) -> NDArray[np.bool_]:
+    """Where (T,) knowing the edge offset would shrink the sigma along the line of sight by WEAK_DEPTH_RATIO; (T, G, G) with priors."""
     rest = [i for i in range(GEOMETRY) if i not in (OFFSET_MM, OFFSET_PX)]
     free = inverse_scaled(information)[:, 2, 2]
     fixed = inverse_scaled(information[:, rest][:, :, rest])[:, 2, 2]
-    flag(free > WEAK_DEPTH_RATIO**2 * fixed, Quality.WEAK_DEPTH)
-    return bits
+    return np.asarray(free > WEAK_DEPTH_RATIO**2 * fixed)
 
 
 def _lost_edges(adjusted: Adjusted, pixels: RingPixels, count: int) -> tuple[Array, Array]:

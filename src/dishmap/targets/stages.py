@@ -36,7 +36,7 @@ from dishmap.targets.scene_noise import (
 )
 from dishmap.targets.solve import inverse_each, inverse_scaled
 from dishmap.targets.start import EllipsePoints, centers_of, ellipse_points, fit_ellipses, nominal_poses, pair_circles, rigid_pose
-from dishmap.targets.window import outline, patches_around, ring_areas, ring_layout, ring_pixels
+from dishmap.targets.window import minor_radius_px, outline, patches_around, ring_areas, ring_layout, ring_pixels
 from dishmap.transforms import Pose, angle_between_rad
 
 Array = NDArray[Any]
@@ -253,9 +253,7 @@ def _shifted(group: Group, points: Array, target: Index, circle: Index) -> Poses
 def layout(image: NDArray[Any], group: Group, blur_px: float, band_blur_px: float) -> tuple[Batch, RingPixels]:
     """Rings and pixels of a group for a given blur, in a band wide enough for `band_blur_px`."""
     outlines = group.outlines()
-    middle = outlines.mean(axis=2, keepdims=True)
-    across = np.linalg.norm(outlines - middle, axis=3).min(axis=2)
-    rings, members, fine = ring_layout(group.kind, outlines, across / group.kind.radius_mm, blur_px)
+    rings, members, fine = ring_layout(group.kind, outlines, minor_radius_px(outlines) / group.kind.radius_mm, blur_px)
     batch = replace(group.batch, rings=rings)
     areas = ring_areas(group.kind, members)
     patches = patches_around(batch.camera, group.poses, batch.curvature_per_mm, areas, band_blur_px)

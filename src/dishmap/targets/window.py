@@ -33,6 +33,11 @@ def outline(camera: Camera, poses: Poses, curvature_per_mm: Array, center_mm: Ar
     return pixels.reshape(len(poses), len(radius_mm), OUTLINE_POINTS, 2)
 
 
+def minor_radius_px(outlines: Array) -> Array:
+    """Least distance (T, C) from the middle of projected circles to their outlines (T, C, Q, 2): the minor semi-axis."""
+    return np.asarray(np.linalg.norm(outlines - outlines.mean(axis=2, keepdims=True), axis=3).min(axis=2))
+
+
 def sharpest_curvature_per_px(outlines: Array) -> Array:
     """Largest curvature (T, C) of projected circles from their outlines: a / b^2 of the ellipse through them."""
     centered = outlines - outlines.mean(axis=2, keepdims=True)
