@@ -24,7 +24,7 @@ from dishmap.simulate.scene import Scene, Sensor, facing_pose
 from dishmap.surface.cloud import calibration_covariance_mm2
 from dishmap.targets.bound import edge_sigma_px
 from dishmap.targets.builders import concentric, disc, dish, multi_circular, plate, ring
-from dishmap.targets.pattern import Pattern
+from dishmap.targets.pattern import Pattern, Polygon, TargetKind
 from dishmap.targets.stages import Assumptions
 from dishmap.transforms import Pose, angle_between_rad, rotation_from_vector
 
@@ -277,6 +277,14 @@ def test_a_sensor_of_no_pixels() -> None:
 def test_impossible_conditions(numbers: dict[str, float], words: str) -> None:
     with pytest.raises(InputError, match=words):
         Conditions(**numbers)  # type: ignore[arg-type]
+
+
+def test_grids_are_refused() -> None:
+    square = TargetKind(np.zeros((0, 2)), np.zeros(0), np.zeros(0, bool), (Polygon(np.array([[-2.0, -2], [2, -2], [2, 2], [-2, 2]])),))
+    line = plate(1, 2, 12.0, disc(2.0))
+    grid = replace(line, kinds=dict.fromkeys(line.kinds, square), lattice=np.array([[0, 0], [1, 0]]))
+    with pytest.raises(InputError, match="a grid of squares or lines cannot be planned"):
+        plan(CAMERA, grid, facing_pose(650.0))
 
 
 def test_an_unknown_way_of_following() -> None:

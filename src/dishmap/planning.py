@@ -144,7 +144,7 @@ def camera_of_lens(width_px: int, height_px: int, fov_deg: float) -> Camera:
 def plan(camera: Camera, pattern: Pattern, camera_from_dish: Pose, conditions: Conditions | None = None) -> Plan:
     """What a photograph of `pattern` by `camera` would tell of every target, and what two would tell of a change.
 
-    Raises InputError when no target can be measured, saying why.
+    Raises InputError when no target can be measured, saying why, and for a grid of squares or lines.
     """
     # many small matrix products: threads would cost more than they bring
     with threadpool_limits(limits=1, user_api="blas"):
@@ -152,6 +152,8 @@ def plan(camera: Camera, pattern: Pattern, camera_from_dish: Pose, conditions: C
 
 
 def _plan(camera: Camera, pattern: Pattern, pose: Pose, given: Conditions) -> Plan:
+    if pattern.is_grid:
+        raise InputError("a grid of squares or lines cannot be planned; a plan is for targets made of circles")
     seen, lost, radius, narrow = _seen(camera, pattern, pose, given)
     if not len(seen):
         raise InputError(_why_nothing(pattern, pose, lost))
