@@ -50,7 +50,7 @@ ORDER = [
     # boards of circles
     *("camera.board_labels", "camera.circle_board"),
     # measuring it as the paper does, and the limit of both
-    *("targets.groups", "targets.paper", "targets.bound", "targets.expected"),
+    *("targets.groups", "targets.paper", "targets.bound", "targets.expected", "targets.grid_bound"),
     # the surface through the points
     *("surface.cloud", "surface.paraboloid", "surface.fit"),
     # the difference between two photographs as the paper has it

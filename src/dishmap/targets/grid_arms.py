@@ -26,10 +26,9 @@ CLEAR_BLURS = 1.5
 
 
 def clear_of_ends(shapes: NodeShapes, maps: LatticeMaps, reach_px: float) -> NodeShapes:
-    """The shapes with arms that end within a node's cell cut short of their ends, by the reach of the blur."""
+    """The shapes with arms cut to a node's own cell, and short of their ends by the reach of the blur."""
     step = np.linalg.norm(maps.step_px, axis=1)
-    short = np.maximum(shapes.arms - reach_px / step[:, :, None], 0.0)
-    return replace(shapes, arms=np.where(shapes.arms < CELL, short, shapes.arms))
+    return replace(shapes, arms=np.clip(shapes.arms - reach_px / step[:, :, None], 0.0, CELL))
 
 
 def arms_there(pixels: NodePixels, light: Array, cover: NDArray[Any], x: Array, blur_px: float) -> Bool:

@@ -26,8 +26,8 @@ class NodeShapes:
 
     crossing: ink is the union of both bands (lines), else their intersection (a rectangle); half (N, 2): half the width of each band in
     lattice units; inner (N, 2): of the light rectangle nested in it, 0 where there is none; arms (N, 2, 2): how far each band goes to the
-    negative and the positive side, at most CELL; boxes (N, B, 4): a from, a to, b from, b to of other ink nearby, NaN for none;
-    pitch_mm (2,): of columns and of rows.
+    negative and the positive side, infinite if it does not end there; boxes (N, B, 4): a from, a to, b from, b to of other ink nearby,
+    NaN for none; pitch_mm (2,): of columns and of rows.
     """
 
     crossing: bool
@@ -52,7 +52,7 @@ def node_shapes(pattern: Pattern) -> NodeShapes:
         return NodeShapes(True, half, np.zeros_like(half), arms, _boxes(pattern, pitch), pitch)
     sizes = {name: _rectangles_mm(name, kind) for name, kind in pattern.kinds.items()}
     half, inner = (np.array([sizes[name][i] for name in pattern.kind_names]) / pitch[::-1] for i in (0, 1))
-    return NodeShapes(False, half, inner, np.full((len(half), 2, 2), CELL), np.full((len(half), 1, 4), np.nan), pitch)
+    return NodeShapes(False, half, inner, np.full((len(half), 2, 2), np.inf), np.full((len(half), 1, 4), np.nan), pitch)
 
 
 def _pitch_mm(pattern: Pattern) -> Array:
@@ -86,7 +86,7 @@ def _rectangles_mm(name: str, kind: TargetKind) -> tuple[Array, Array]:
 
 def _lines(pattern: Pattern, pitch_mm: Array) -> tuple[Array, Array]:
     assert pattern.lattice is not None
-    half, arms = np.zeros((len(pattern), 2)), np.full((len(pattern), 2, 2), CELL)
+    half, arms = np.zeros((len(pattern), 2)), np.full((len(pattern), 2, 2), np.inf)
     row_of = {int(i): row for row, i in enumerate(pattern.ids)}
     for line in pattern.lines:
         rows = np.array([row_of[i] for i in line.ids])
@@ -98,7 +98,7 @@ def _lines(pattern: Pattern, pitch_mm: Array) -> tuple[Array, Array]:
         half[rows, band] = 0.5 * line.width_mm / pitch_mm[1 - band]
         order = np.argsort(pattern.lattice[rows, band])
         for side, end in ((0, order[0]), (1, order[-1])):
-            arms[rows[end], band, side] = min(CELL, line.overhang_mm / pitch_mm[band])
+            arms[rows[end], band, side] = line.overhang_mm / pitch_mm[band]
     if not half.all():
         raise PatternError("at each target of a grid of lines one line must run along the row and one along the column")
     return half, arms

@@ -38,6 +38,8 @@ Index = NDArray[np.int64]
 
 # Nodes whose pixels together stay in the processor's cache.
 COARSE_AT_ONCE, FULL_AT_ONCE = 160, 48
+# Nodes that lie closer have too few pixels to leave any out.
+COARSE_STEP_PX = 20.0
 # Edges are felt this far, in blurs and px; what is looked at before the blur is known.
 REACH_BLURS, REACH_EXTRA_PX = 2.5, 0.5
 FIRST_BLUR_PX, FIRST_REACH_PX = 1.2, 3.5
@@ -195,12 +197,17 @@ def _coarse_chunk(
 ) -> tuple[Stage, NodeFit, NodePixels]:
     priors = priors_of(maps, shapes, first, held=True)
     x, share = _start(priors), np.full(len(shapes.half), FIRST_INK_SHARE)
-    pixels = node_pixels(image, maps, clear_of_ends(shapes, maps, reach_px), x[:, HALF], reach_px, coarse=True)
+    coarse = np.median(np.linalg.norm(maps.step_px, axis=1)) > COARSE_STEP_PX
+    pixels = node_pixels(image, maps, clear_of_ends(shapes, maps, reach_px), x[:, HALF], reach_px, coarse=bool(coarse))
     weights = Weights(1.0, 0.0, None, known=False)
     there = np.ones((len(x), 2, 2), bool)
     if shapes.crossing:
-        light, _, cover = levels_at(pixels, x, share, shapes.crossing)
-        there = arms_there(pixels, light, cover, x, first.blur_px)
+        # one step brings lines under the model; what misled it is then seen and left out
+        nearer = one_step(pixels, x, share, priors, weights, shapes.crossing).x
+        light, _, cover = levels_at(pixels, nearer, share, shapes.crossing)
+        there = arms_there(pixels, light, cover, nearer, first.blur_px)
+        whole = there.all(axis=(1, 2))
+        x[whole] = nearer[whole]
         pixels = without_arms(pixels, x, there, reach_px)
     before = None
     for step in range(COARSE_STEPS):
