@@ -162,10 +162,13 @@ def _kind_text(kind: TargetKind) -> str:
     if kind.polygons:
         key, rows = "polygons", [{"corners_mm": [_rounded(c, 9) for c in p.corners_mm], "inside": _inside(p.dark)} for p in kind.polygons]
     elif len(kind.radius_mm):
-        key, rows = "circles", [
-            {"center_mm": _rounded(c, 9), "radius_mm": round(float(r), 9), "inside": _inside(bool(dark))}
-            for c, r, dark in zip(kind.center_mm, kind.radius_mm, kind.dark, strict=True)
-        ]
+        key, rows = (
+            "circles",
+            [
+                {"center_mm": _rounded(c, 9), "radius_mm": round(float(r), 9), "inside": _inside(bool(dark))}
+                for c, r, dark in zip(kind.center_mm, kind.radius_mm, kind.dark, strict=True)
+            ],
+        )
     else:
         return "{}"
     return f"{{\n   {json.dumps(key)}: [\n{_lines(rows, '    ')}\n   ]\n  }}"
