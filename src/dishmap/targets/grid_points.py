@@ -31,7 +31,7 @@ from dishmap.targets.grid_stages import (
     learn,
     with_lines,
 )
-from dishmap.targets.lattice_map import LatticeMaps, lattice_maps, lines_by, place_sigma_px
+from dishmap.targets.lattice_map import LatticeMaps, lattice_maps, lines_by, place_sigma_px, strays
 from dishmap.targets.pattern import Pattern
 from dishmap.targets.pose import (
     HIDDEN_BELOW,
@@ -43,6 +43,7 @@ from dishmap.targets.pose import (
     check_pixels,
 )
 from dishmap.targets.scene_noise import NoiseModel
+from dishmap.targets.solve import inverse_each
 from dishmap.targets.stages import OCCLUDED_BELOW
 
 Array = NDArray[Any]
@@ -134,10 +135,14 @@ def _measure(image: NDArray[Any], pattern: Pattern, shapes: NodeShapes, index: I
     moved = measured_vector(maps, stage.x, shapes.crossing)[0][:, :2]
     moved = np.where(good[:, None], moved, maps.origin_px)
     sigma = place_sigma_px(lattice, moved, good, LEAST_SIGMA_PX)
+    # what stands in the way may have led a node astray: it is looked for again where its neighbours say
+    astray, expected = strays(lattice, moved, good, sigma, np.zeros(len(moved)))
+    moved[astray] = expected[astray]
+    measurable, good = good, good & ~astray
     maps = lattice_maps(lattice, moved, good, sigma)
-    rejected += _named(pattern, index[good & ~maps.known], "too few of its neighbours could be measured")
-    rejected += [(int(pattern.ids[i]), _why_lost(stage, shapes, row)) for row, i in enumerate(index) if not good[row]]
-    rows = np.flatnonzero(good & maps.known)
+    rejected += _named(pattern, index[measurable & ~maps.known], "too few of its neighbours could be measured")
+    rejected += [(int(pattern.ids[i]), _why_lost(stage, shapes, row)) for row, i in enumerate(index) if not measurable[row]]
+    rows = np.flatnonzero(measurable & maps.known)
     if not len(rows):
         raise MeasurementError(
             "no node of the grid could be measured: no such lines or squares are seen there; give a sharper photograph or the right pattern"
@@ -204,11 +209,18 @@ def _collect(
     lost, bright = stage.kept < OCCLUDED_BELOW, stage.brighter | (stage.saturated > MOST_SATURATED)
     bits[(lost & bright) | (stage.saturated > MOST_SATURATED)] |= int(Quality.GLARE)
     bits[lost & ~bright] |= int(Quality.OCCLUDED)
+    covariance = inverse_each(np.where(finite[:, None, None], information, 0.0))
+    own = np.sqrt(np.maximum(covariance[:, 0, 0] + covariance[:, 1, 1], 0.0) / 2)
+    assert pattern.lattice is not None
+    astray, expected = strays(pattern.lattice[index], y[:, :2], ~is_rejected(bits), sigma_px, own)
+    for i in np.flatnonzero(astray):
+        apart = float(np.linalg.norm(expected[i] - y[i, :2]))
+        rejected.append((int(pattern.ids[index[i]]), f"it lies {apart:.2g} px from where its neighbours say; something hides it"))
     out = is_rejected(bits) | (stage.kept < HIDDEN_BELOW * (0.5 if shapes.crossing else 1.0))
-    for i in np.flatnonzero(out):
+    for i in np.flatnonzero(out & ~astray):
         why = names(int(bits[i])) if is_rejected(bits[i : i + 1])[0] else "most of its edges are hidden"
         rejected.append((int(pattern.ids[index[i]]), why.replace("|", ", ").replace("_", " ")))
-    some = ~out
+    some = ~(out | astray)
     half = None if shapes.crossing else np.stack([y[some, 2:4], y[some, 4:6]], axis=2)
     return GridPoints(
         index=index[some],

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from dishmap.targets.grid_arms import arms_there, clear_of_ends, without_arms
 from dishmap.targets.grid_fit import (
@@ -31,6 +32,7 @@ from dishmap.targets.grid_shapes import NodeShapes
 from dishmap.targets.lattice_map import LatticeMaps
 from dishmap.targets.scene_noise import NoiseModel, inflation_of, noise_model
 from dishmap.targets.solve import inverse_each, solve_scaled
+from dishmap.targets.stages import OBSTACLE_BLURS, OCCLUDED_BELOW
 
 Array = NDArray[Any]
 Bool = NDArray[Any]
@@ -48,6 +50,8 @@ FIRST_LOG_BLUR, FIRST_LOG_HALF = 0.7, 0.3
 LEAST_LOG_BLUR, LEAST_LOG_HALF = 0.1, 0.1
 # Slope and bend of the level line of each band.
 LINE = (np.array([SLOPE.start, BEND.start]), np.array([SLOPE.start + 1, BEND.start + 1]))
+# A pixel of less weight is lost to what is in front.
+LOST_BELOW = 0.5
 # A rectangle's own turn and shear, in radians or so.
 FREE_SLOPE = 0.2
 COARSE_STEPS, FULL_STEPS, FREE_STEPS, COARSE_ENOUGH = 7, 6, 2, 0.9
@@ -294,4 +298,36 @@ def _full_chunk(
             getattr(stage, name)[rest] = getattr(part, name)
         white[rest], used[rest], before[rest] = fit.white, fit.robust > 0, fit.robust
         rest = rest[~fit.converged]
-    return stage, (white, used)
+    return _clear_of_obstacles(pixels, stage, priors, weights, shapes.crossing, before), (white, used)
+
+
+def _clear_of_obstacles(
+    pixels: NodePixels, stage: Stage, priors: NodePriors, weights: Weights, crossing: bool, robust: NDArray[Any]
+) -> Stage:
+    """Fit nodes that lost part of their edges once more, without the pixels beside the lost ones.
+
+    At the border of whatever is in front, pixels are a mixture that passes for noise but pulls on the edge.
+    """
+    rows = np.flatnonzero((stage.whole < OCCLUDED_BELOW) & stage.converged)
+    if not len(rows):
+        return stage
+    chosen = np.isin(np.arange(len(stage.x)), rows)
+    some = pixels.take(chosen)
+    used = some.used.copy()
+    for k, row in enumerate(rows):
+        place = np.stack([some.s[k], some.t[k]], axis=1) * some.unit_px[k]
+        lost = some.used[k] & (robust[row] < LOST_BELOW)
+        if lost.any():
+            far, _ = cKDTree(place[lost]).query(place)
+            used[k] &= far > OBSTACLE_BLURS * stage.x[row, BLUR] + 1.0
+    clear = replace(some, used=used)
+    own = NodePriors(priors.mean[rows], priors.precision[rows])
+    x, share = stage.x[rows], stage.ink_share[rows]
+    for _ in range(FREE_STEPS + 1):
+        fit = one_step(clear, x, share, own, weights, crossing)
+        x, share = fit.x, fit.ink_share
+    part = _stage(fit, stage.there[rows], clear)
+    for name in Stage.__dataclass_fields__:
+        if name not in ("kept", "whole", "saturated", "brighter"):
+            getattr(stage, name)[rows] = getattr(part, name)
+    return stage

@@ -40,6 +40,8 @@ OFFSETS = np.array([(i, j) for i in range(-REACH, REACH + 1) for j in range(-REA
 # A coefficient of the second power is half a derivative.
 DERIVATIVE = np.array([1.0, 2.0])
 SIGMA_GUESS_PX = 0.02
+# A node this far from where its neighbours say, in sigmas, shows something else than the print.
+STRAY_SIGMAS, STRAY_ROUNDS = 8.0, 4
 # Places of a, aa and of b, bb among the monomials.
 ALONG = (
     np.array([POWERS.index((1, 0)), POWERS.index((2, 0))]),
@@ -138,6 +140,28 @@ def lines_by(maps: LatticeMaps, lattice: Index, place_px: Array, usable: Bool, s
     change = smoothed.forward - maps.forward
     mean = [np.einsum("nu,nuk->nk", inverse[:, 1 - band, 1:3], change[:, :, k]) * DERIVATIVE for band, k in enumerate(ALONG)]
     return np.stack(mean, axis=1), _along(inverse, smoothed)
+
+
+def strays(lattice: Index, place_px: Array, usable: Bool, sigma_px: float, own_px: Array) -> tuple[Bool, Array]:
+    """Nodes (N,) that lie far from where their neighbours say, and where that is (N, 2).
+
+    own_px (N,): sigma of each place besides `sigma_px`. One that is astray makes its neighbours look so: the worst among them goes first.
+    """
+    astray = np.zeros(len(place_px), bool)
+    for _ in range(STRAY_ROUNDS):
+        good = usable & ~astray
+        smoothed = _smoothed(lattice, place_px, good, sigma_px)
+        variance = smoothed.posterior[:, 0, 0] * smoothed.step_px**2 + sigma_px**2 + own_px**2
+        far = np.linalg.norm(smoothed.forward[:, :, 0], axis=1) / np.sqrt(variance)
+        known = variance < (KNOWN_PART * smoothed.step_px) ** 2 + sigma_px**2 + own_px**2
+        far = np.where(good & known, far, 0.0)
+        neighbours = _neighbours(lattice, good)
+        worst = far >= np.where(neighbours >= 0, far[neighbours], 0.0).max(axis=1)
+        new = (far > STRAY_SIGMAS) & worst
+        if not new.any():
+            break
+        astray |= new
+    return astray, place_px + _smoothed(lattice, place_px, usable & ~astray, sigma_px).forward[:, :, 0]
 
 
 def place_sigma_px(lattice: Index, place_px: Array, usable: Bool, least_px: float) -> float:
