@@ -72,8 +72,8 @@ class Conditions:
 class Plan:
     """What is expected of one photograph, and of the difference of two.
 
-    cloud: the N targets that can be measured, on the undeformed pattern in the camera frame, with the covariances that a map would
-    claim; normal_sigma_rad: spread of normals about the pattern's surface, as it would be learnt, their prior; shape_mm, displacement_mm
+    cloud: the N targets that can be measured, on the undeformed pattern in the camera frame, with the covariances of their errors;
+    normal_sigma_rad: spread of normals about the pattern's surface, as it would be learnt, their prior; shape_mm, displacement_mm
     (N,): standard deviations in mm of the change of shape (rigid motion removed) and of the displacement along the normal from two such
     photographs, NaN for fewer than LEAST_TARGETS targets; lost: (id, reason) of the others; view_rad (N,): angle between normal and line
     of sight; smallest_radius_px, narrowest_px (N,): smallest circle, and narrowest stroke of ink or ground within the target.
@@ -210,6 +210,15 @@ def narrowest_mm(kind: TargetKind) -> float:
     aside = np.linalg.norm(kind.center_mm[nested] - kind.center_mm[outer], axis=1)
     strokes = kind.radius_mm[outer] - kind.radius_mm[nested] - aside
     return float(min([kind.gap_mm, 2 * float(kind.radius_mm.min()), *strokes.tolist()]))
+
+
+def print_bend_mm(kind: TargetKind, amplitude_mm: float, length_mm: float) -> float:
+    """How far the prints of a target leave its tangent plane, on average over their edges, when the surface moves: standard deviation.
+
+    A Matern 5/2 field has curvatures of standard deviation 5 amplitude / length^2 along each axis, of correlation 1/3 between the two.
+    """
+    square = (np.linalg.norm(kind.center_mm, axis=1) ** 2 + kind.radius_mm**2) @ kind.radius_mm / kind.radius_mm.sum()
+    return float(0.25 * square * 5 * amplitude_mm / length_mm**2 * np.sqrt(8 / 3))
 
 
 def _cloud(camera: Camera, pattern: Pattern, pose: Pose, found: Expected) -> PointCloud:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.difference.changes import LEAST_TARGETS
-from dishmap.planning import Plan
+from dishmap.planning import Plan, print_bend_mm
 from dishmap.quality import MEANING, Quality
 from dishmap.surface.cloud import calibration_covariance_mm2
 from dishmap.targets.bound import PIXEL_VARIANCE_PX2
@@ -145,5 +145,11 @@ def _limits(plan: Plan, figures: dict[str, Figure]) -> list[str]:
         out.append(
             f"Two photographs hardly show a change of {rough(plan.conditions.amplitude_mm)} mm: the sigma of {rough(shape)} mm rests "
             "on that stated size."
+        )
+    bend = max(print_bend_mm(plan.pattern.kind_of(int(i)), plan.conditions.amplitude_mm, plan.length_mm) for i in plan.index)
+    if figures["sigma_shape_mm"].median < bend:
+        out.append(
+            f"A change of {rough(plan.conditions.amplitude_mm)} mm over {rough(plan.length_mm)} mm bends the prints themselves by about "
+            f"{rough(bend)} mm, which the estimate does not follow: expect errors of shape of that size; smaller targets bend less."
         )
     return out

@@ -1,7 +1,8 @@
-"""What a photograph that was not taken yet would tell of each target: the sigmas that its measurement would claim.
+"""What a photograph that was not taken yet would tell of each target: the standard deviations of its measurement's errors.
 
-From the same Fisher information as the bound and the fit, with the priors that the fit would have: on ink, tone and blur as assumed, and on
-normals the spread that it would learn from such a photograph.
+From the same Fisher information as the bound and the fit, with the priors that the fit would have: on ink, tone and blur as assumed,
+and on normals the spread that it would learn from such a photograph. Where that comes out wider than normals truly stray, errors are
+smaller than the sigmas that the measurement claims, which hold for normals that stray as far as learnt.
 """
 
 from __future__ import annotations
@@ -17,27 +18,16 @@ from dishmap.quality import Quality
 from dishmap.targets.adjust import POSE_AND_OFFSET, on_pose_and_offset, prior_terms
 from dishmap.targets.bound import edge_sigma_px, group_information, pattern_groups
 from dishmap.targets.pattern import Pattern
-from dishmap.targets.pixels import TONE
 from dishmap.targets.pose import SMALLEST_RADIUS_PX, rests_on_offset
 from dishmap.targets.scene_noise import LEAST_NORMAL_SIGMA_RAD, normal_spread
 from dishmap.targets.sensitivity import calibration_jacobian
 from dishmap.targets.solve import inverse_scaled
-from dishmap.targets.stages import (
-    FIRST_LOG_GAMMA_SIGMA,
-    FIRST_NORMAL_SIGMA_RAD,
-    LEAST_LOG_GAMMA_SIGMA,
-    Assumptions,
-    Group,
-    printed_ink,
-)
+from dishmap.targets.stages import FIRST_NORMAL_SIGMA_RAD, Assumptions, Group, printed_ink
 from dishmap.targets.window import minor_radius_px
 from dishmap.transforms import Pose
 
 Array = NDArray[Any]
 Index = NDArray[np.int64]
-
-# Of the pixels, the coarse fit that finds the tone curve sees one in four.
-COARSE_SHARE = 0.25
 
 
 @dataclass(frozen=True)
@@ -45,7 +35,7 @@ class Expected:
     """What is expected of T targets on the undeformed pattern, in the order of `index`; names and meaning as in `TargetPoses`.
 
     information (T, 7, 7) of the pixels alone on (move along camera axes in mm, turn about target axes in rad, edge offset in mm);
-    covariance (T, 6, 6) of move and turn with the priors; covariance_px2 (T, 2, 2) of the centre's image; sigma_normal_rad (T,);
+    covariance (T, 6, 6) of the errors of move and turn; covariance_px2 (T, 2, 2) of the centre's image; sigma_normal_rad (T,);
     calibration_jacobian (T, 3, P); quality (T,): the bits `too_small` and `weak_depth`; normal_sigma_rad: the spread of normals that
     serves as prior; smallest_radius_px (T,): of any circle, at its narrowest.
     """
@@ -74,18 +64,17 @@ def expected_targets(
     """What a photograph would tell of targets number `index` (T,), rising, which must lie wholly within the picture.
 
     stray_rad: how far true normals stray from the pattern's surface, standard deviation per axis. The prior on normals is the spread
-    that would be learnt from such targets, unless the assumptions give it.
+    that would be learnt from such targets. The assumptions may give both: their normal_sigma_deg is what normals stray by, too.
     """
     groups = pattern_groups(camera, pattern, index, camera_from_dish, psf_sigma_px, assumptions)
     ink = printed_ink(camera, pattern, groups, camera_from_dish)
     full = [group_information(group, contrast_to_noise, ink) for group in groups]
-    groups = _with_shared_tone(groups, full)
     if assumptions.normal_sigma_deg is not None:
-        spread = max(float(np.radians(assumptions.normal_sigma_deg)), LEAST_NORMAL_SIGMA_RAD)
+        spread = stray_rad = max(float(np.radians(assumptions.normal_sigma_deg)), LEAST_NORMAL_SIGMA_RAD)
     else:
         spread = learnt_spread(np.concatenate([_tilt_covariance(g, f) for g, f in zip(groups, full, strict=True)]), stray_rad)
     edge_information = edge_sigma_px(float(groups[0].state.blur_px[0]), contrast_to_noise) ** -2.0
-    parts = [_columns(camera, group, data, spread, edge_information) for group, data in zip(groups, full, strict=True)]
+    parts = [_columns(camera, group, data, spread, stray_rad, edge_information) for group, data in zip(groups, full, strict=True)]
     order = np.argsort(np.concatenate([group.index for group in groups]))
     columns = {name: np.concatenate([part[name] for part in parts])[order] for name in parts[0]}
     return Expected(index=index, normal_sigma_rad=spread, **columns)
@@ -101,34 +90,25 @@ def learnt_spread(tilt_covariance: Array, stray_rad: float) -> float:
     return normal_spread(np.einsum("tij,tj->ti", vectors, along), tilt_covariance, FIRST_NORMAL_SIGMA_RAD)
 
 
-def _with_shared_tone(groups: list[Group], full: list[Array]) -> list[Group]:
-    """The groups with what all targets together say of the tone curve, as `stages.shared_tone` pools it from a share of the pixels."""
-    data = [1 / _covariance(g, f)[:, TONE, TONE] - g.batch.priors.log_gamma_sigma**-2.0 for g, f in zip(groups, full, strict=True)]
-    total = COARSE_SHARE * float(np.maximum(np.concatenate(data), 0.0).sum()) + FIRST_LOG_GAMMA_SIGMA**-2
-    sigma = max(total**-0.5, LEAST_LOG_GAMMA_SIGMA)
-    return [replace(g, batch=replace(g.batch, priors=replace(g.batch.priors, log_gamma_sigma=sigma))) for g in groups]
-
-
-def _covariance(group: Group, full: Array) -> Array:
-    """Covariance (T, G, G) of the geometry from the pixels and the group's priors."""
-    precision, _ = prior_terms(group.poses, group.state, group.batch.priors)
-    return inverse_scaled(full + precision[:, :, None] * np.eye(precision.shape[1]))
-
-
 def _tilt_covariance(group: Group, full: Array) -> Array:
     """Covariance (T, 2, 2) of the tilts from the pixels alone, without a prior on normals."""
     # the group's own prior is wide enough to say nothing
-    return _covariance(group, full)[:, 3:5, 3:5]
+    precision, _ = prior_terms(group.poses, group.state, group.batch.priors)
+    return inverse_scaled(full + precision[:, :, None] * np.eye(precision.shape[1]))[:, 3:5, 3:5]
 
 
-def _columns(camera: Camera, group: Group, full: Array, spread_rad: float, edge_information: float) -> dict[str, Array]:
+def _columns(camera: Camera, group: Group, full: Array, spread_rad: float, stray_rad: float, edge_information: float) -> dict[str, Array]:
     """Columns of Expected for one group, keyed by field name."""
     count, poses = len(group.index), group.poses
     priors = replace(group.batch.priors, normal_sigma_rad=np.full(count, spread_rad))
     precision, _ = prior_terms(poses, group.state, priors)
     information, axes = on_pose_and_offset(full, precision, poses.steps)
     posterior = full + precision[:, :, None] * np.eye(precision.shape[1])
-    fitted = inverse_scaled(posterior)[:, POSE_AND_OFFSET][:, :, POSE_AND_OFFSET]
+    claimed = inverse_scaled(posterior)
+    # the prior's own part of the error is that of true normals: P^-1 (P - L + L S L) P^-1 for a prior L and true variances S
+    excess = (1 - (stray_rad / spread_rad) ** 2) / spread_rad**2
+    errors = claimed - excess * claimed[:, :, 3:5] @ claimed[:, 3:5]
+    fitted = errors[:, POSE_AND_OFFSET][:, :, POSE_AND_OFFSET]
     covariance = (axes @ fitted @ np.swapaxes(axes, 1, 2))[:, :6, :6]
     _, by_point = camera.project_with_point_jacobian(poses.position_mm)
     radius = minor_radius_px(group.outlines()).min(axis=1)
