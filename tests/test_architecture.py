@@ -50,7 +50,8 @@ ORDER = [
     # boards of circles
     *("camera.board_labels", "camera.circle_board"),
     # measuring it as the paper does, and the limit of both
-    *("targets.groups", "targets.paper", "targets.bound", "targets.expected", "targets.grid_bound"),
+    *("targets.groups", "targets.paper", "targets.plane_pose", "targets.grid_corners", "targets.grid_paper"),
+    *("targets.bound", "targets.expected", "targets.grid_bound"),
     # the surface through the points
     *("surface.cloud", "surface.paraboloid", "surface.fit"),
     # the difference between two photographs as the paper has it
@@ -107,6 +108,8 @@ WALLS = {
         "targets.detect",
         "targets.grid_crossings",
         "targets.grid_refine",
+        "targets.plane_pose",
+        "targets.grid_corners",
         "io.images",
         "io.camera_file",
         "io.picture_file",

@@ -101,12 +101,13 @@ def measure_grid(image: NDArray[Any], pattern: Pattern, index: Index, place_px: 
     """
     check_pixels(image)
     index, place = np.asarray(index, np.int64).reshape(-1), np.asarray(place_px, dtype=float).reshape(-1, 2)
-    _check_nodes(pattern, index, place)
+    check_nodes(pattern, index, place)
     with threadpool_limits(limits=1, user_api="blas"), np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         return _measure(image, pattern, node_shapes(pattern).take(index), index, place)
 
 
-def _check_nodes(pattern: Pattern, index: Index, place: Array) -> None:
+def check_nodes(pattern: Pattern, index: Index, place: Array) -> None:
+    """Raise InputError unless nodes `index` (K,) are different ones of the pattern, with finite places (K, 2)."""
     if len(index) != len(place):
         raise InputError(f"{len(index)} nodes but {len(place)} places were given; give one place in the image for each node")
     if len(index) and not (index.min() >= 0 and index.max() < len(pattern)):

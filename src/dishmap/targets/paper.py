@@ -54,9 +54,10 @@ KMEANS_STARTS = 5
 class PaperPoses:
     """Targets measured by the paper's method, in the camera frame; the method gives no uncertainty.
 
-    index: place in the pattern; ids (T,); center_px (T, 2): the K-means centre C_p in the undistorted image; position_mm, normal
-    (T, 3), the normal towards the camera; depth_mm (T,) along the camera's z; delta_alpha_rad, area_px2 (T,); quality (T,)
-    bits; rejected: (id, reason) of named targets that could not be measured; view: the view the steps were taken in.
+    index: place in the pattern; ids (T,); center_px (T, 2): the K-means centre C_p in the undistorted image (of grids: level_0);
+    position_mm, normal (T, 3), the normal towards the camera; depth_mm (T,) along the camera's z; delta_alpha_rad, area_px2 (T,), of
+    grids those of the largest squares about the target; quality (T,) bits; rejected: (id, reason) of named targets that could not be
+    measured; view: the view the steps were taken in; method: its name.
     """
 
     index: Ints
@@ -94,7 +95,7 @@ def paper_poses(
     only where the image does not tell the sign of a tilt. Raises CameraError for a camera with distortion or of another size,
     ImageError for an image that is not grey, InputError for arrays that do not fit.
     """
-    _check(image, camera)
+    check_undistorted(image, camera)
     group = group_circles(pattern, detections, mark, detection)
     angle = np.asarray(detections.angle_rad, dtype=float)
     start = Ellipses.exact(detections.center_px, detections.semi_axes_px, angle)
@@ -147,7 +148,8 @@ def poses_from_ellipses(
     )
 
 
-def _check(image: NDArray[np.generic], camera: Camera) -> None:
+def check_undistorted(image: NDArray[np.generic], camera: Camera) -> None:
+    """Raise CameraError or ImageError unless this is a grey image and the pinhole camera that could have taken it."""
     if camera.model != "opencv" or camera.distortion.any():
         raise CameraError("the paper's method works on an undistorted image: give that image and its pinhole camera, without distortion")
     if image.ndim != 2:
@@ -194,7 +196,7 @@ def _measure(
         nearer = bool((both[1] - both[0]) @ (turn @ expected) > 0)
     normal = both[int(nearer)]
     normal = -normal if normal @ sight > 0 else normal
-    delta = delta_alpha_rad(axis_ends_px(largest)[0] / focal, normal)
+    delta = float(delta_alpha_rad(axis_ends_px(largest)[0] / focal, normal))
     area = float(circles.area_px2.sum())
     printed = float(np.pi * (kind.radius_mm[circle] ** 2).sum())
     z = float(depth_from_area_mm(area, printed, delta, 1 / focal))
@@ -321,19 +323,19 @@ def nearer_per_px(circles: Ellipses, look: Ints, place: Ints, direction: Array) 
 # ---- list (1)-(4) and Algorithm 1, step (4): angular difference and depth ----
 
 
-def delta_alpha_rad(vertices: Array, normal: Array) -> float:
-    """The angular difference: 90 degrees minus the mean angle between the target's lines and the lines of sight.
+def delta_alpha_rad(vertices: Array, normal: Array) -> Array:
+    """The angular difference (...): 90 degrees minus the mean angle between a target's lines and the lines of sight.
 
-    vertices (W, 2): x/z, y/z of the target's vertices; normal (3,) of its plane, whose distance does not matter.
+    vertices (..., W, 2): x/z, y/z of the target's vertices; normal (..., 3) of its plane, whose distance does not matter.
     """
-    rays = np.concatenate([vertices, np.ones((len(vertices), 1))], axis=1)
-    on_plane = rays / (rays @ normal)[:, None]
-    first, second = np.triu_indices(len(rays), 1)
+    rays = np.concatenate([vertices, np.ones((*vertices.shape[:-1], 1))], axis=-1)
+    on_plane = rays / (rays @ normal[..., None])
+    first, second = np.triu_indices(rays.shape[-2], 1)
     # (a) the plane through the camera and w1, w2 cuts the target's plane in l1; (b) l2 goes to the middle between them
-    l1 = np.cross(normal, np.cross(rays[first], rays[second]))
-    l2 = on_plane[first] + on_plane[second]
-    alpha = np.arctan2(np.linalg.norm(np.cross(l1, l2), axis=1), np.abs((l1 * l2).sum(axis=1)))
-    return float(np.pi / 2 - alpha.mean())
+    l1 = np.cross(normal[..., None, :], np.cross(rays[..., first, :], rays[..., second, :]))
+    l2 = on_plane[..., first, :] + on_plane[..., second, :]
+    alpha = np.arctan2(np.linalg.norm(np.cross(l1, l2), axis=-1), np.abs((l1 * l2).sum(axis=-1)))
+    return np.asarray(np.pi / 2 - alpha.mean(axis=-1))
 
 
 def depth_from_area_mm(area_px2: ArrayLike, printed_area_mm2: ArrayLike, delta_alpha_rad: ArrayLike, c_camera_rad_per_px: float) -> Array:

@@ -135,7 +135,15 @@ def _edge_points(image: NDArray[np.generic], found: Ellipses, half_width: Array,
     c, s = np.cos(phi)[:, None], np.sin(phi)[:, None]
     on = found.center_px[:, None] + a * c * along + b * s * across
     outward = b * c * along + a * s * across
-    outward = outward / np.linalg.norm(outward, axis=-1, keepdims=True)
+    return edge_points(image, on, outward / np.linalg.norm(outward, axis=-1, keepdims=True), half_width)
+
+
+def edge_points(image: NDArray[np.generic], on: Array, outward: Array, half_width: Array) -> tuple[Array, Flags]:
+    """Points (M, N, 2) where profiles cross the middle grey level, and where they do (M, N).
+
+    Profiles go through `on` along unit vectors `outward` (M, N, 2), half_width (M,) px to both sides; the levels of both sides are
+    those of all N profiles of an edge together.
+    """
     steps = int(np.ceil(half_width.max() / PROFILE_STEP_PX))
     t = np.linspace(-1, 1, 2 * steps + 1) * half_width[:, None]
     uv = on[:, :, None] + t[:, None, :, None] * outward[:, :, None]
