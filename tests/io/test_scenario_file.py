@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from dishmap.errors import CameraError, InputError
-from dishmap.io.scenario_file import KindName, parse_scenario, read_scenario
+from dishmap.io.scenario_file import parse_scenario, read_scenario
+from dishmap.io.scenario_pattern import KindName
 from dishmap.simulate.scenario import Scenario, State, simulate_states
 from dishmap.simulate.scene import Disc, Polygon, Ribs
 from dishmap.targets.builders import KIND_BUILDERS
@@ -154,8 +155,8 @@ def test_kinds_are_those_of_the_builders() -> None:
         ('kind = "ring"', 'kind = "rings"', "pattern.plate.kind must be 'disc', 'ring'"),
         ("pitch_mm = 30", "pitch_mm = 10", "a pitch of 10 mm is too small"),
         ("rows = 2, ", "", "pattern.plate lacks the key 'rows'"),
-        ("plate =", "# plate =", r"\[pattern\] needs one of file, plate and dish, not none"),
-        ("[pattern]", "[pattern]\nfile = 'a.json'", r"\[pattern\] needs one of file, plate and dish, not file and plate"),
+        ("plate =", "# plate =", r"\[pattern\] needs one of file, plate, dish and grid, not none"),
+        ("[pattern]", "[pattern]\nfile = 'a.json'", r"\[pattern\] needs one of file, plate, dish and grid, not file and plate"),
         ("width_px = 320", "", r"\[camera\] needs either file, or width_px, height_px and focal_px"),
         ("width_px = 320", "file = 'a.yaml'", r"\[camera\] needs either file or the camera's numbers, not both"),
         ("focal_px = 500", "focal_px = -500", "a camera's focal length must be positive"),
@@ -195,3 +196,33 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     (tmp_path / "large.toml").write_bytes(b"#" * 1_000_001)
     with pytest.raises(InputError, match="larger than 1 MB"):
         read_scenario(tmp_path / "large.toml")
+
+
+GRID = Path(__file__).resolve().parents[2] / "examples" / "scenario_grid.toml"
+
+
+def test_a_grid_with_broken_lines() -> None:
+    scene = read_scenario(GRID).states[1].scene
+    assert scene.pattern.is_grid
+    assert scene.pattern.surface == Surface("paraboloid", 300.0, 150.0)
+    pieces = sum(len(line.ids) - 1 for line in scene.pattern.lines)
+    assert (scene.line_gaps[0].line, scene.line_gaps[0].start_t, scene.line_gaps[0].stop_t) == (3, 4.5, 6.5)
+    assert len(scene.line_gaps) == 1 + round(0.15 * pieces)
+    # the same file breaks the same lines, in every state
+    assert scene.line_gaps == read_scenario(GRID).states[0].scene.line_gaps
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ("line_mm = 1.0", "", "give line_mm or square_mm, and not both"),
+        ("line_mm = 1.0", "line_width_mm = 1.0", "unknown key 'line_width_mm' in pattern.grid; the nearest valid one is 'line_mm'"),
+        ("diameter_mm = 300", "", "the surface 'dish' needs diameter_mm"),
+        ('"dish"  ', '"cylinder"  ', "the surface 'cylinder' needs cylinder_radius_mm|diameter_mm is no size of the surface 'cylinder'"),
+        ("line = 3", "line = 300", "a gap is in line 300, but the pattern has"),
+        ("broken_share = 0.15", "broken_share = 15", "print.broken_share must be less than or equal to 1"),
+    ],
+)
+def test_mistakes_in_a_grid_are_named(old: str, new: str, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        parse_scenario(GRID.read_text().replace(old, new, 1))

@@ -1,32 +1,44 @@
 """Scenario files: TOML of the format `dishmap-scenario/1`, which say what `dishmap simulate` photographs.
 
-The models below are the format; `examples/scenario_dish.toml` shows all of it. Angles are in degrees, files are found
+The models below and those of `scenario_pattern` are the format; `examples/scenario_dish.toml` and `examples/scenario_grid.toml` show
+all of it. Angles are in degrees, files are found
 relative to the scenario's own folder.
 """
 
 from __future__ import annotations
 
 import difflib
-import inspect
 import os
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from dishmap.camera.model import Camera
 from dishmap.errors import InputError
 from dishmap.io.camera_file import read_camera
-from dishmap.io.pattern_file import read_pattern
+from dishmap.io.scenario_pattern import STRICT, PatternSource, pattern_of
 from dishmap.simulate.deform import Bump, Crease, Deformation, Gores, ZernikeTerm
 from dishmap.simulate.scenario import Scenario, State
-from dishmap.simulate.scene import Disc, Glare, Light, Polygon, Ribs, Scene, Sensor, Shape, facing_pose, random_shapes
+from dishmap.simulate.scene import (
+    Disc,
+    Glare,
+    Light,
+    LineGap,
+    Polygon,
+    Ribs,
+    Scene,
+    Sensor,
+    Shape,
+    facing_pose,
+    random_line_gaps,
+    random_shapes,
+)
 from dishmap.surface.zernike import parse_term
-from dishmap.targets.builders import KIND_BUILDERS, dish, plate
-from dishmap.targets.pattern import Pattern, TargetKind
+from dishmap.targets.pattern import Pattern
 from dishmap.transforms import Pose
 
 FORMAT = "dishmap-scenario/1"
@@ -37,43 +49,12 @@ NAME = r"^[A-Za-z0-9][A-Za-z0-9._+-]{0,99}$"
 
 Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 Triple = Annotated[list[float], Field(min_length=3, max_length=3)]
-KindName = Literal["disc", "ring", "concentric", "multi", "whycon"]
+# States take the streams [seed, 0], [seed, 1] and so on; this one is far beyond them.
+BROKEN_STREAM = 2**31
 
 
 class _Model(BaseModel):
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class PlateModel(_Model):
-    """A flat plate of targets."""
-
-    rows: int
-    columns: int
-    pitch_mm: float
-    kind: KindName = "multi"
-    kind_options: dict[str, int | float | list[float]] = {}
-    orientation_marks: bool = False
-
-
-class DishModel(_Model):
-    """Targets on concentric circles of a paraboloid."""
-
-    diameter_mm: float
-    focal_length_mm: float
-    spacing_mm: float = 45.0
-    kind: KindName = "multi"
-    kind_options: dict[str, int | float | list[float]] = {}
-    orientation_marks: bool = False
-    margin_mm: float | None = None
-    center_target: bool = True
-
-
-class PatternSource(_Model):
-    """What is printed: a pattern file, or a plate or a dish to be built."""
-
-    file: str | None = None
-    plate: PlateModel | None = None
-    dish: DishModel | None = None
+    model_config = STRICT
 
 
 class CameraSource(_Model):
@@ -127,11 +108,21 @@ class SensorModel(_Model):
     bits: int = Sensor.bits
 
 
+class GapModel(_Model):
+    """Missing ink of a line of a grid, as `dishmap.simulate.scene.LineGap`."""
+
+    line: int
+    start: float
+    stop: float
+
+
 class PrintModel(_Model):
-    """Ink spread, and the margin of a pattern without a rim."""
+    """Ink spread, the margin of a pattern without a rim, and where a grid's lines are broken."""
 
     ink_spread_mm: float = Scene.ink_spread_mm
     margin_mm: float = Scene.margin_mm
+    broken_share: Annotated[float, Field(ge=0, le=1)] = 0.0
+    gaps: list[GapModel] = []
 
 
 class RibsModel(_Model):
@@ -275,14 +266,16 @@ def _scenario(model: ScenarioModel, folder: Path) -> Scenario:
     # the seed's own stream, apart from those of the states' noise
     rng = np.random.default_rng(model.seed)
     shapes = random_shapes(rng, camera, clutter.discs, clutter.rings, clutter.rectangles, _pair(clutter.size_px), _pair(clutter.grey))
+    pattern = pattern_of(model.pattern, folder)
     scene = Scene(
-        pattern=_pattern(model.pattern, folder),
+        pattern=pattern,
         camera=camera,
         camera_from_dish=_pose(model.pose),
         light=_light(model.light),
         sensor=Sensor(**model.sensor.model_dump()),
         ink_spread_mm=model.print.ink_spread_mm,
         margin_mm=model.print.margin_mm,
+        line_gaps=_line_gaps(model, pattern),
         ribs=tuple(_ribs(ribs) for ribs in model.ribs),
         background=(*shapes, *(_shape(shape, "background") for shape in model.background)),
         occluders=tuple(_shape(shape, "occluders") for shape in model.occluders),
@@ -290,30 +283,12 @@ def _scenario(model: ScenarioModel, folder: Path) -> Scenario:
     return Scenario(model.name, model.seed, tuple(_state(scene, state) for state in model.states))
 
 
-def _pattern(model: PatternSource, folder: Path) -> Pattern:
-    given = [name for name in ("file", "plate", "dish") if getattr(model, name) is not None]
-    if len(given) != 1:
-        raise InputError(f"[pattern] needs one of file, plate and dish, not {' and '.join(given) or 'none'}")
-    if model.file is not None:
-        return read_pattern(folder / model.file)
-    source = model.plate or model.dish
-    assert source is not None
-    numbers = source.model_dump(exclude={"kind", "kind_options"})
-    kind = _kind(source.kind, source.kind_options)
-    build = plate if model.plate is not None else dish
-    return build(**numbers, kind=kind, kind_name=source.kind)
-
-
-def _kind(name: str, options: dict[str, Any]) -> TargetKind:
-    known = list(inspect.signature(KIND_BUILDERS[name]).parameters)
-    for option, value in options.items():
-        if option not in known:
-            near = difflib.get_close_matches(option, known, n=1, cutoff=0.0)[0]
-            raise InputError(f"unknown option {option!r} of kind {name!r}; the nearest valid one is {near!r} (all: {', '.join(known)})")
-        wanted = {"radii_mm": list, "count": int}.get(option, (int, float))
-        if not isinstance(value, wanted):
-            raise InputError(f"kind_options of {name!r} need numbers (radii_mm a list of them, count a whole one), not {options}")
-    return KIND_BUILDERS[name](**options)
+def _line_gaps(model: ScenarioModel, pattern: Pattern) -> tuple[LineGap, ...]:
+    given = tuple(LineGap(gap.line, gap.start, gap.stop) for gap in model.print.gaps)
+    if not model.print.broken_share:
+        return given
+    # a stream of the seed's own, apart from clutter and noise
+    return (*given, *random_line_gaps(np.random.default_rng([model.seed, BROKEN_STREAM]), pattern, model.print.broken_share))
 
 
 def _camera(model: CameraSource, folder: Path) -> Camera:

@@ -27,6 +27,8 @@ PLACES_PER_MARK = 12
 TRIALS_PER_COUNT = 20
 # Around a cylinder nothing is printed beyond this part of the half that faces the camera.
 LARGEST_TURN = 0.95 * np.pi / 2
+# Surfaces of grids by name, and the sizes that each has.
+SURFACE_NAMES: dict[str, tuple[str, ...]] = {"plane": (), "dish": ("diameter_mm", "focal_length_mm"), "cylinder": ("cylinder_radius_mm",)}
 # Half of this step of the lattice gives the direction of a column.
 AXIS_STEP = 1e-3
 
@@ -49,6 +51,27 @@ def square(side_mm: float) -> TargetKind:
 def open_square(side_mm: float) -> TargetKind:
     """A dark square with a light square of half its side in its middle."""
     return _of_polygons((_square(side_mm), _square(OPEN_PART * side_mm, dark=False)))
+
+
+def grid_surface(
+    kind: str = "plane", diameter_mm: float | None = None, focal_length_mm: float | None = None, cylinder_radius_mm: float | None = None
+) -> Surface:
+    """The surface of a grid by one of SURFACE_NAMES and its sizes.
+
+    Raises PatternError when a size is lacking or belongs to another surface.
+    """
+    if kind not in SURFACE_NAMES:
+        raise PatternError(f"unknown surface {kind!r}; use one of {', '.join(SURFACE_NAMES)}")
+    given = {"diameter_mm": diameter_mm, "focal_length_mm": focal_length_mm, "cylinder_radius_mm": cylinder_radius_mm}
+    needs = SURFACE_NAMES[kind]
+    for name, value in given.items():
+        if value is None and name in needs:
+            raise PatternError(f"the surface {kind!r} needs {name}")
+        if value is not None and name not in needs:
+            raise PatternError(f"{name} is no size of the surface {kind!r}; it takes {' and '.join(needs) or 'none'}")
+    if kind == "dish":
+        return Surface("paraboloid", diameter_mm, focal_length_mm)
+    return Surface(kind, radius_mm=cylinder_radius_mm)
 
 
 def grid(
