@@ -70,8 +70,9 @@ ORDER = [
     # and what it would give, before there is a photograph
     "planning",
     # paper to print
-    *("sheet.shapes", "sheet.pdf", "sheet.svg", "sheet.flatten", "sheet.pieces", "sheet.seams", "sheet.gores", "sheet.markers"),
-    *("sheet.boards", "sheet.outline", "sheet.paper", "sheet.tiles", "sheet.layout", "sheet.printed", "sheet.sheets"),
+    *("sheet.shapes", "sheet.pdf", "sheet.svg", "sheet.flatten", "sheet.pieces", "sheet.outline", "sheet.ruled"),
+    *("sheet.seams", "sheet.gores", "sheet.markers"),
+    *("sheet.boards", "sheet.paper", "sheet.tiles", "sheet.layout", "sheet.printed", "sheet.sheets"),
     # files
     *("io.atomic", "io.image_header", "io.images", "io.picture_file", "io.pose_file", "io.camera_formats", "io.camera_file"),
     "io.pattern_file",

@@ -18,7 +18,7 @@ from dishmap.io.pattern_file import read_pattern, write_pattern
 from dishmap.sheet.flatten import AlongMeridian, AroundVertex
 from dishmap.sheet.gores import cut_targets, dish_pieces
 from dishmap.sheet.outline import inside
-from dishmap.sheet.pieces import reach_mm
+from dishmap.sheet.pieces import ink_places
 from dishmap.targets.builders import disc, dish, multi_circular
 from dishmap.targets.detect import find_ellipses
 from dishmap.targets.flat import meridian_mm, radius_mm
@@ -102,7 +102,7 @@ def test_printed_gores_laid_back_on_the_dish_put_every_circle_in_its_place(gores
 def test_the_strain_that_is_stated_is_that_of_the_paper(gores: Path) -> None:
     pattern, listing = read_pattern(gores / "pattern.json"), json.loads((gores / "sheets.json").read_text())
     azimuth = {piece["name"]: piece["azimuth_deg"] for piece in listing["pieces"]}
-    reach, step, compared = float(reach_mm(pattern).max()), 0.05, 0
+    reach, step, compared = float(ink_places(pattern)[1].max()), 0.05, 0
     for entry in listing["placed"]:
         for row in entry["targets"][:1]:
             flat = np.array(row["at_mm"]) - entry["shift_mm"]

@@ -141,7 +141,7 @@ def test_targets_without_a_free_cut_lie_on_tabs_and_are_said(tmp_path: Path) -> 
         (["dish", "--diameter-mm", 300, "--focal-length-mm", 300, "--corner-marks", "aruco"], "corner marks belong to flat patterns"),
         (["dish", "--diameter-mm", 300, "--focal-length-mm", 300, "--largest-strain-percent", 0], "finite number above 0"),
         (["plat", "--rows", 3], "'--rows'"),
-        (["plat"], "'plat' is neither a pattern file nor one of plate, dish, board"),
+        (["plat"], "'plat' is neither a pattern file nor one of plate, dish, grid, board"),
         (["gone.json"], "cannot read the pattern file gone.json"),
     ],
 )

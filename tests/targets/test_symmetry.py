@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dishmap.targets.builders import disc, dish, multi_circular, plate, ring
+from dishmap.targets.grid_builders import grid, marked_crossing
 from dishmap.targets.pattern import Pattern, Surface
 from dishmap.targets.symmetry import symmetry_poses
 from dishmap.transforms import Pose, rotation_from_vector
@@ -100,3 +102,33 @@ def test_fast_for_a_thousand_targets(pattern: Pattern) -> None:
     poses = symmetry_poses(pattern)
     assert time.process_time() - start < LIMIT_S
     assert len(poses) in (1, 999)
+
+
+@pytest.mark.parametrize("ink", [{"line_width_mm": 1.0}, {"square_mm": 8.0}], ids=["lines", "squares"])
+@pytest.mark.parametrize(
+    ("columns", "rows", "surface", "expected"),
+    [
+        (7, 5, Surface(), [180.0]),
+        (6, 6, Surface(), [90.0, 180.0, 270.0]),
+        (6, 6, Surface("cylinder", radius_mm=57.0), [180.0]),
+        (12, 12, Surface("paraboloid", 120.0, 60.0), [90.0, 180.0, 270.0]),
+        (12, 9, Surface("paraboloid", 120.0, 60.0), [180.0]),
+    ],
+)
+def test_grids_look_the_same_after_quarter_turns(columns: int, rows: int, surface: Surface, expected: list[float], ink: dict) -> None:
+    pattern = grid(columns, rows, 12.0, surface=surface, **ink)
+    assert turns_deg(pattern) == expected
+    poses = symmetry_poses(pattern)
+    for pose in poses:
+        moved = pose.apply(pattern.center_mm)
+        assert np.linalg.norm(moved[:, None] - pattern.center_mm, axis=-1).min(axis=1).max() < 1e-9
+    assert symmetry_poses(grid(columns, rows, 12.0, surface=surface, orientation_marks=True, **ink)) == []
+
+
+def test_the_mark_of_a_crossing_stands_in_the_middle_of_its_cell() -> None:
+    """One mark in the middle cell of an even grid keeps all quarter turns; beside it, none."""
+    plain = grid(6, 6, 12.0, line_width_mm=1.0)
+    kinds = {**plain.kinds, "crossing-marked": marked_crossing(12.0)}
+    for place, expected in (((2, 2), [90.0, 180.0, 270.0]), ((2, 3), [])):
+        names = ["crossing-marked" if tuple(p) == place else "crossing" for p in np.asarray(plain.lattice).tolist()]
+        assert turns_deg(replace(plain, kinds=kinds, kind_names=names)) == expected

@@ -15,7 +15,9 @@ from dishmap.errors import InputError
 if TYPE_CHECKING:
     from dishmap.targets.pattern import Pattern, TargetKind
 
-# A test holds these to `dishmap.targets.builders.KIND_BUILDERS`, which is not loaded for the sake of a help text.
+# Tests hold these to SURFACE_NAMES of `dishmap.targets.grid_builders` and KIND_BUILDERS of `builders`, which are not loaded for the sake of
+# a help text.
+SURFACES = ("plane", "dish", "cylinder")
 KINDS = ("disc", "ring", "concentric", "multi", "whycon")
 
 
@@ -115,6 +117,59 @@ def dish_of(
 
     target, kind_name = kind_of(**kind)
     return dish(diameter_mm, focal_length_mm, spacing_mm, target, kind_name, orientation_marks, margin_mm, not no_center_target, name)
+
+
+def _grid_options(command: F) -> F:
+    options = [
+        click.option("--columns", type=click.IntRange(1), required=True, help="Places along x."),
+        click.option("--rows", type=click.IntRange(1), required=True, help="Places along y."),
+        click.option("--pitch-mm", type=POSITIVE, required=True, help="From place to place along the surface."),
+        click.option("--line-mm", type=POSITIVE, help="Width of the lines of a grid of lines."),
+        click.option("--square-mm", type=POSITIVE, help="Side of the squares of a grid of squares."),
+        click.option("--surface", type=click.Choice(SURFACES), default="plane", show_default=True, help="What the grid is printed on."),
+        click.option("--diameter-mm", type=POSITIVE, help="Of a dish's rim."),
+        click.option("--focal-length-mm", type=POSITIVE, help="Of a dish."),
+        click.option("--cylinder-radius-mm", type=Number(), help="Of a cylinder along y: negative if it is hollow towards the camera."),
+        click.option("--orientation-marks", is_flag=True, help="Let a few squares be open, or put squares into a few cells between lines."),
+        click.option("--name", default="", help="Name of the pattern, written into the file."),
+        out_file("Pattern file (JSON)"),
+    ]
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+@pattern_group.command("grid")
+@_grid_options
+def grid_command(out: Path, **options: Any) -> None:
+    """A grid of lines or of separate squares."""
+    _write(grid_of(**options), out)
+
+
+def grid_of(
+    columns: int,
+    rows: int,
+    pitch_mm: float,
+    line_mm: float | None,
+    square_mm: float | None,
+    surface: str,
+    diameter_mm: float | None,
+    focal_length_mm: float | None,
+    cylinder_radius_mm: float | None,
+    orientation_marks: bool,
+    name: str,
+) -> Pattern:
+    """The grid that the options describe. Sizes that are lacking or that this surface does not have are usage errors."""
+    from dishmap.targets.grid_builders import SURFACE_NAMES, grid, grid_surface
+
+    sizes = {"diameter_mm": diameter_mm, "focal_length_mm": focal_length_mm, "cylinder_radius_mm": cylinder_radius_mm}
+    for size, value in sizes.items():
+        if (value is None) == (size in SURFACE_NAMES[surface]):
+            said = "needs" if value is None else "does not take"
+            raise click.UsageError(f"--surface {surface} {said} {_word(size)}")
+    if (line_mm is None) == (square_mm is None):
+        raise click.UsageError("a grid is made of lines or of squares: give --line-mm or --square-mm, and not both")
+    return grid(columns, rows, pitch_mm, line_mm, square_mm, grid_surface(surface, **sizes), orientation_marks, name)
 
 
 def kind_of(kind: str, **sizes: Any) -> tuple[TargetKind, str]:

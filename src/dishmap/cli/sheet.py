@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dishmap.cli.options import PATH, POSITIVE, F, Grid, Number, Numbers, out_folder, refuse_overwriting
-from dishmap.cli.pattern import PatternGroup, dish_command, dish_of, own_options, pattern_in, plate_command, plate_of
+from dishmap.cli.pattern import PatternGroup, dish_command, dish_of, grid_command, grid_of, own_options, pattern_in, plate_command, plate_of
 from dishmap.cli.terminal import say
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ _strain_option = click.option(
 )
 
 
-@click.group("sheet", cls=PatternGroup, subcommand_metavar="PATTERN|plate|dish|board [OPTIONS]...")
+@click.group("sheet", cls=PatternGroup, subcommand_metavar="PATTERN|plate|dish|grid|board [OPTIONS]...")
 def sheet_group() -> None:
     """Print a pattern or a calibration board at true scale: PDF and SVG, with the pattern file beside them."""
 
@@ -94,6 +94,14 @@ def plate_sheet(out: Path, **options: Any) -> None:
 def dish_sheet(out: Path, **options: Any) -> None:
     """Gores of a dish, to glue on or to cut stencils from."""
     _make(dish_of(**_without_sheet_options(options)), out, **_only_sheet_options(options))
+
+
+@sheet_group.command("grid", params=own_options(grid_command))
+@_strain_option
+@_sheet_options
+def grid_sheet(out: Path, **options: Any) -> None:
+    """Sheets of a grid of lines or squares; a cylinder's unrolled, a dish's as cap and gores."""
+    _make(grid_of(**_without_sheet_options(options)), out, **_only_sheet_options(options))
 
 
 @sheet_group.command("board")
@@ -189,7 +197,7 @@ def _say_printed(sheets: Sheets, measured_mm: list[float], file: Path) -> None:
     scale = [measured / sheets.paper.bar_mm for measured in measured_mm]
     say(f"{file}: as printed, {100 * (scale[0] - 1):+.2f} % along x and {100 * (scale[1] - 1):+.2f} % along y of the sheets")
     uneven = abs(scale[0] / scale[1] - 1)
-    if uneven >= UNEVEN and isinstance(sheets.what, Pattern):
+    if uneven >= UNEVEN and isinstance(sheets.what, Pattern) and not sheets.what.is_grid:
         say(
             f"  circles are ellipses by {uneven:.2%}, which a pattern file cannot hold: places are right, but a target seen face on looks "
             "tilted; better print on a printer that is even both ways"

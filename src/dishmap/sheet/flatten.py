@@ -12,7 +12,7 @@ lengths across those ways are longer on the paper than on the surface by a littl
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -45,18 +45,22 @@ class FlatMap(Protocol):
 
 @dataclass(frozen=True)
 class Flat:
-    """A plane: nothing changes."""
+    """A plane, or a cylinder unrolled: all lengths stay."""
+
+    surface: Surface = field(default_factory=Surface)
 
     def to_flat(self, xy_mm: Array) -> Array:
-        """The same points."""
-        return np.asarray(xy_mm, dtype=float)
+        """Where points of the surface lie on the paper."""
+        return to_flat_mm(self.surface, xy_mm)
 
-    to_surface = to_flat
+    def to_surface(self, flat_mm: Array) -> Array:
+        """Where points of the paper lie on the surface."""
+        return from_flat_mm(self.surface, flat_mm)
 
     def axes(self, flat_mm: Array) -> tuple[Array, Array]:
-        """The x and y axes."""
-        x, y = (np.tile(row, (len(flat_mm), 1)) for row in np.eye(3)[:2])
-        return x, y
+        """Unit vectors (N, 3) along the surface into which the paper's x and y go."""
+        y = np.tile([0.0, 1.0, 0.0], (len(flat_mm), 1))
+        return np.cross(y, self.surface.normal(self.to_surface(flat_mm))), y
 
     def stretch(self, flat_mm: Array, reach_mm: Array) -> Array:
         """One everywhere."""

@@ -13,10 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from dishmap.errors import PatternError
 from dishmap.sheet.flatten import AlongMeridian, AroundVertex
-from dishmap.sheet.pieces import Piece, flat_piece, reach_mm
+from dishmap.sheet.pieces import Piece, flat_piece, ink_places, strained_mm
+from dishmap.sheet.ruled import with_lines
 from dishmap.sheet.seams import CLEARANCE_MM, ROOM, ROW_MM, Ground, Seams, find_seams
 from dishmap.sheet.shapes import Line
 from dishmap.targets.flat import meridian_mm, radius_mm
@@ -39,6 +41,7 @@ ARC_STEP_MM, TICKS_AT, TICK_MM = 2.0, (0.25, 0.75), 3.0
 class _Dish:
     """The targets of a pattern in polar coordinates: way_mm (N,) from the vertex along the meridian, azimuth (N,), reach_mm (N,).
 
+    These are of point_mm (N, 3), the middle of each target's own ink; strained_mm (N,): about it, where the strain counts.
     limit: of the strain; room_mm: width and height that a piece should not exceed.
     """
 
@@ -48,6 +51,8 @@ class _Dish:
     way_mm: Array
     azimuth: Array
     reach_mm: Array
+    point_mm: Array
+    strained_mm: Array
     limit: float
     room_mm: tuple[float, float]
 
@@ -95,7 +100,7 @@ def cut_targets(pieces: tuple[Piece, ...]) -> list[int]:
     found = []
     for piece in pieces:
         if piece.outline_mm is not None:
-            distance = np.linalg.norm(piece.center_mm[:, None] - piece.outline_mm[None], axis=-1).min(axis=1)
+            distance = np.linalg.norm(piece.keep_mm[:, None, :2] - piece.outline_mm[None], axis=-1).min(axis=1)
             found += [int(k) for k in piece.target[distance < piece.keep_mm[:, 2]]]
     return sorted(found)
 
@@ -104,24 +109,28 @@ def _dish(pattern: Pattern, limit: float, room_mm: tuple[float, float]) -> _Dish
     focal = pattern.surface.focal_length_mm
     if focal is None:
         raise PatternError("gores are made of a paraboloid; this pattern's surface is a plane")
-    way = meridian_mm(np.hypot(*pattern.center_mm[:, :2].T), focal)
-    reach = reach_mm(pattern)
+    point, reach = ink_places(pattern)
+    strained = strained_mm(pattern)
+    way = meridian_mm(np.hypot(*point[:, :2].T), focal)
     rim = float((way + reach).max()) + 2 * CLEARANCE_MM
     if pattern.surface.diameter_mm is not None:
         rim = max(rim - 2 * CLEARANCE_MM, float(meridian_mm(np.array(pattern.surface.diameter_mm / 2), focal)))
     # a target alone in the middle of its piece, at the vertex, where the curvature is largest
-    least = float(1 - AlongMeridian(focal, 0.0).stretch(np.zeros((1, 2)), reach.max(keepdims=True))[0])
+    least = float(1 - AlongMeridian(focal, 0.0).stretch(np.zeros((1, 2)), strained.max(keepdims=True))[0])
     if least > limit:
         raise PatternError(
-            f"a target of radius {reach.max():.4g} mm shrinks by {least:.2%} when it is laid on a dish of focal length {focal:g} mm, "
+            f"a target of radius {strained.max():.4g} mm shrinks by {least:.2%} when it is laid on a dish of focal length {focal:g} mm, "
             f"beyond the limit of {limit:.2%}: take smaller targets, or allow {100 * least:.2g} percent or more"
         )
-    azimuth = np.arctan2(pattern.center_mm[:, 1], pattern.center_mm[:, 0])
-    return _Dish(pattern, focal, rim, way, azimuth, reach, limit, room_mm)
+    azimuth = np.arctan2(point[:, 1], point[:, 0])
+    return _Dish(pattern, focal, rim, way, azimuth, reach, point, strained, limit, room_mm)
 
 
 def _free_circles(dish: _Dish) -> list[float]:
-    """Ways from the vertex at which a circle meets no target: before the first one, amid gaps, behind the last, and the rim."""
+    """Ways from the vertex at which a circle meets no target: before the first one, amid gaps, behind the last, and the rim.
+
+    A circle cannot pass between the squares of a lattice, and lines may be cut, so that in a grid there is one every step.
+    """
     low, high = dish.way_mm - dish.reach_mm, dish.way_mm + dish.reach_mm
     order = np.argsort(low)
     reached = np.maximum.accumulate(high[order])
@@ -129,6 +138,9 @@ def _free_circles(dish: _Dish) -> list[float]:
     middle = (low[order][1:] + reached[:-1]) / 2
     first, last = float(low.min()) - 2 * CLEARANCE_MM, float(high.max()) + 2 * CLEARANCE_MM
     inner = [first, *(float(m) for m in middle[gap > 2 * CLEARANCE_MM]), last]
+    if dish.pattern.is_grid:
+        step = float(np.median(cKDTree(dish.pattern.center_mm).query(dish.pattern.center_mm, k=[2])[0]))
+        inner = np.arange(step, last, step).tolist()
     return [*(edge for edge in inner if 0 < edge < dish.rim_mm), dish.rim_mm]
 
 
@@ -137,7 +149,7 @@ def _cap_fits(dish: _Dish, edge: float) -> bool:
         return False
     inside = dish.within(0, edge)
     flat = np.column_stack([dish.way_mm[inside], np.zeros(len(inside))])
-    return bool((1 - AroundVertex(dish.focal_length_mm).stretch(flat, dish.reach_mm[inside]) <= dish.limit).all())
+    return bool((1 - AroundVertex(dish.focal_length_mm).stretch(flat, dish.strained_mm[inside]) <= dish.limit).all())
 
 
 def _cap(dish: _Dish, edge: float) -> Piece:
@@ -146,18 +158,28 @@ def _cap(dish: _Dish, edge: float) -> Piece:
     note = "around the vertex, its tick at azimuth 0"
     tick = Line(np.array([[edge - TICK_MM, 0.0], [edge, 0.0]]))
     flat = AroundVertex(dish.focal_length_mm)
-    return _with_extra(flat_piece("cap", dish.pattern, flat, dish.within(0, edge), outline, np.zeros(2), note), tick)
+    piece = _with_extra(flat_piece("cap", dish.pattern, flat, dish.within(0, edge), outline, np.zeros(2), note), tick)
+    return with_lines(piece, dish.pattern, flat.to_surface(outline))
 
 
 def _next_zone(dish: _Dish, inner: float, edges: list[float]) -> _Zone:
-    """The widest zone from `inner` on whose seams cut no target, or the narrowest with the fewest cut."""
+    """The widest zone from `inner` on whose seams cut no target, or the narrowest with the fewest cut.
+
+    Seams cut lines anyway, and orientation marks among them are few: there it is the widest with the fewest marks cut.
+    """
     for outer in reversed(edges):
         least = _fewest(dish, inner, outer)
-        for count in range(least, least + MORE_GORES):
+        found: list[_Zone] = []
+        # seams that wind around marks make gores wider, and so there must be more of them
+        more = max(MORE_GORES, least // 2) if dish.pattern.lines else MORE_GORES
+        for count in range(least, least + more):
             if not _too_long(dish, inner, outer, count) and not _too_narrow(dish, dish.within(inner, outer), count):
                 for zone in _zones(dish, inner, outer, count):
                     if not zone.seams.crossed:
                         return zone
+                    found.append(zone)
+        if dish.pattern.lines and found:
+            return min(found, key=lambda zone: len(zone.seams.crossed))
     for count in range(_fewest(dish, inner, edges[0]), COUNTS[-1] + 1):
         zones = list(_zones(dish, inner, edges[0], count))
         if zones:
@@ -171,7 +193,7 @@ def _zones(dish: _Dish, inner: float, outer: float, count: int) -> Iterator[_Zon
     """Zones with this number of gores within the limit."""
     target = dish.within(inner, outer)
     way = np.linspace(inner, outer, max(2, int(np.ceil((outer - inner) / ROW_MM)) + 1))
-    ground = Ground(dish.pattern.center_mm[target], dish.reach_mm[target], dish.focal_length_mm)
+    ground = Ground(dish.point_mm[target], dish.reach_mm[target], dish.focal_length_mm)
     for phase in PHASES:
         seams = find_seams(ground, way, radius_mm(way, dish.focal_length_mm), count, phase * 2 * np.pi / count)
         zone = _Zone(inner, outer, seams, target, _owners(dish, target, seams))
@@ -205,7 +227,7 @@ def _fewest(dish: _Dish, inner: float, outer: float) -> int:
         owner = np.floor(np.mod(dish.azimuth[target], 2 * np.pi) / (2 * np.pi) * count).astype(int)
         aside = radius * np.abs(np.sin(dish.azimuth[target] - _middles(dish.azimuth[target], owner, count)[owner]))
         # winding seams can do a little better than straight ones
-        if (gauss * (aside + dish.reach_mm[target]) ** 2 / 2 <= 1.2 * dish.limit).all():
+        if (gauss * (aside + dish.strained_mm[target]) ** 2 / 2 <= 1.2 * dish.limit).all():
             return count
     return COUNTS[-1]
 
@@ -248,7 +270,7 @@ def _zone_strain(dish: _Dish, zone: _Zone) -> float:
     radius, turn = radius_mm(dish.way_mm[zone.target], dish.focal_length_mm), dish.azimuth[zone.target] - middle
     flat = AlongMeridian(dish.focal_length_mm, 0.0)
     at = flat.to_flat(radius[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1))
-    return float(np.abs(1 - flat.stretch(at, dish.reach_mm[zone.target])).max())
+    return float(np.abs(1 - flat.stretch(at, dish.strained_mm[zone.target])).max())
 
 
 def _gores(dish: _Dish, zone: _Zone, number: int) -> list[Piece]:
@@ -257,15 +279,17 @@ def _gores(dish: _Dish, zone: _Zone, number: int) -> list[Piece]:
     pieces = []
     for k, flat in enumerate(_zone_maps(dish, zone)):
         own = zone.target[zone.owner == k]
-        if not len(own):
+        if not len(own) and not dish.pattern.lines:
             continue
         here, following = zone.seams.azimuth_rad[k], zone.seams.azimuth_rad[(k + 1) % count] + 2 * np.pi * (k + 1 == count)
-        outline = flat.to_flat(_around(dish, zone, here, following))
+        ground = _around(dish, zone, here, following)
+        outline = flat.to_flat(ground)
         degrees = np.degrees(flat.azimuth_rad) % 360
         note = f"middle line at azimuth {degrees:.3f} degrees, from {zone.inner_mm:.2f} to {zone.outer_mm:.2f} mm along the surface"
         anchor = np.array([0.0, (zone.inner_mm + zone.outer_mm) / 2])
         piece = flat_piece(f"gore {number}.{k + 1:02d}", dish.pattern, flat, own, outline, anchor, note)
-        pieces.append(_with_extra(piece, *_ticks(dish, zone, flat, (here, following))))
+        piece = _with_extra(piece, *_ticks(dish, zone, flat, (here, following)))
+        pieces.append(with_lines(piece, dish.pattern, ground))
     return pieces
 
 

@@ -64,7 +64,11 @@ def lay_out(
         shapes = [shape.moved(place.shift_mm) for shape in _shapes(piece, place, tile, crosses, ink_of, low, high)]
         # lines along the border are printed in their whole width
         box = np.concatenate([low + place.shift_mm - LINE_MM, high + place.shift_mm + LINE_MM])
-        drawn[place.page].append(Group(tuple(shapes), tuple(float(v) for v in box)))  # type: ignore[arg-type]
+        clip = (float(box[0]), float(box[1]), float(box[2]), float(box[3]))
+        drawn[place.page].append(Group(tuple(shapes), clip))
+        if piece.lines:
+            outline = None if piece.outline_mm is None else piece.outline_mm + place.shift_mm
+            drawn[place.page].append(Group(tuple(ink.moved(place.shift_mm) for ink in piece.lines), clip, outline))
     pages = []
     for number, content in enumerate(drawn, start=1):
         own = [_name(pieces, place) for place in places if place.page == number - 1]

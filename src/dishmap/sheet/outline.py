@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from dishmap.sheet.pieces import TAB_MM, Piece
-from dishmap.sheet.shapes import Line, Words
+from dishmap.sheet.shapes import Line, Words, edge_points
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -15,6 +15,8 @@ Flags = NDArray[np.bool_]
 TAB_POINTS = 73
 # Letters of a piece's name, the step of the search for a free place for it, and free paper around it.
 NAME_MM, NAME_STEP_MM, NAME_MARGIN_MM = 2.0, 3.0, 1.0
+# Between the lines of a grid there may be room for small letters only.
+SMALL_NAMES_MM = (1.3, 0.9)
 # Width of a letter over its height in Helvetica, for the longest of words.
 LETTER_WIDTH = 0.8
 
@@ -37,24 +39,35 @@ def name_words(piece: Piece, low: Array, high: Array) -> list[Words]:
     """The piece's name at a free place inside its outline and within the box low, high (2,); nothing where there is none."""
     if piece.outline_mm is None:
         return []
-    width = LETTER_WIDTH * NAME_MM * len(piece.name)
-    first, last = low + NAME_MARGIN_MM, high - NAME_MARGIN_MM - np.array([width, NAME_MM])
+    sizes = (NAME_MM, *SMALL_NAMES_MM) if piece.lines else (NAME_MM,)
+    return next((words for size in sizes if (words := _name_words(piece, low, high, size))), [])
+
+
+def _name_words(piece: Piece, low: Array, high: Array, size_mm: float) -> list[Words]:
+    """The name in letters of this height where there is room for them."""
+    assert piece.outline_mm is not None
+    width = LETTER_WIDTH * size_mm * len(piece.name)
+    first, last = low + NAME_MARGIN_MM, high - NAME_MARGIN_MM - np.array([width, size_mm])
     x, y = (np.arange(a, b, NAME_STEP_MM) for a, b in zip(first, last, strict=True))
     if not (len(x) and len(y)):
         return []
     corner = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    along = np.linspace(0, 1, 5)
-    box = np.stack(np.meshgrid(along * width, np.array([0.0, 1.0]) * NAME_MM), axis=-1).reshape(-1, 2)
+    # between lines the box must be looked at closely
+    along = np.linspace(0, 1, 25 if piece.lines else 5)
+    box = np.stack(np.meshgrid(along * width, np.array([0.0, 1.0]) * size_mm), axis=-1).reshape(-1, 2)
     points = corner[:, None] + box
     marks = np.concatenate([piece.outline_mm, *(line.points_mm for line in piece.extra if isinstance(line, Line))])
     free = cKDTree(marks).query(points.reshape(-1, 2))[0].reshape(points.shape[:2]).min(axis=1) > NAME_MARGIN_MM
+    edges = edge_points(piece.lines, NAME_MARGIN_MM / 2)
+    if len(edges):
+        free &= cKDTree(edges).query(points.reshape(-1, 2))[0].reshape(points.shape[:2]).min(axis=1) > NAME_MARGIN_MM / 2
     for x_mm, y_mm, radius in piece.keep_mm:
         free &= np.linalg.norm(points - np.array([x_mm, y_mm]), axis=-1).min(axis=1) > radius + NAME_MARGIN_MM
     free[free] = inside(points[free].reshape(-1, 2), piece.outline_mm).reshape(-1, len(box)).all(axis=1)
     if not free.any():
         return []
     best = corner[free][np.argmin(np.linalg.norm(corner[free] - piece.anchor_mm, axis=1))]
-    return [Words(best, piece.name, NAME_MM)]
+    return [Words(best, piece.name, size_mm)]
 
 
 def inside(points: Array, polygon: Array) -> Flags:

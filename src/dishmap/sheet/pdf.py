@@ -74,14 +74,20 @@ def _clip(group: Group) -> Iterator[str]:
     if group.clip_mm is not None:
         left, bottom, right, top = group.clip_mm
         yield f"{_numbers(left, bottom, right - left, top - bottom)} re W n"
+    if group.outline_mm is not None:
+        yield f"{_polygon(group.outline_mm)} W n"
 
 
 def _ink(ink: Ink) -> Iterator[str]:
     for center, radius in zip(ink.center_mm, ink.radius_mm, strict=True):
         yield from _circle(center, float(radius))
     for polygon in ink.polygons_mm:
-        yield f"{_numbers(*polygon[0])} m " + " ".join(f"{_numbers(*point)} l" for point in polygon[1:]) + " h"
+        yield _polygon(polygon)
     yield "f*"
+
+
+def _polygon(points: Array) -> str:
+    return f"{_numbers(*points[0])} m " + " ".join(f"{_numbers(*point)} l" for point in points[1:]) + " h"
 
 
 def _circle(center: Array, radius: float) -> Iterator[str]:

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from dishmap.sheet.flatten import FlatMap
 from dishmap.sheet.shapes import Ink, Shape
-from dishmap.targets.pattern import Pattern
+from dishmap.targets.pattern import Pattern, bent_print_mm
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -28,7 +29,8 @@ class Piece:
     on the surface over length on the paper, the one farthest from 1 in the target; keep_mm (k, 3): x, y and radius of what no cut
     may cross (the targets, corner marks, or a board's corners); extra: what is printed besides targets; outline_mm (m, 2): closed,
     where to cut, None for a plane; low_mm, high_mm (2,): the box of all of it; map: how it goes onto the surface; anchor_mm (2,):
-    the point that is laid in its place, so that a print of the wrong size is off by nothing there; note: how to place it, in words.
+    the point that is laid in its place, so that a print of the wrong size is off by nothing there; note: how to place it, in words;
+    lines: the ink of a grid's lines, to be cut off at the outline.
     """
 
     name: str
@@ -44,6 +46,7 @@ class Piece:
     map: FlatMap
     anchor_mm: Array
     note: str = ""
+    lines: tuple[Ink, ...] = ()
 
     @property
     def strain(self) -> float:
@@ -56,22 +59,44 @@ def flat_piece(name: str, pattern: Pattern, flat: FlatMap, target: Index, outlin
     center = flat.to_flat(pattern.center_mm[target, :2])
     x, y = flat.axes(center)
     angle = np.arctan2((pattern.x_axis[target] * y).sum(axis=1), (pattern.x_axis[target] * x).sum(axis=1))
-    reach = reach_mm(pattern)[target]
-    stretch = flat.stretch(center, reach)
-    keep = np.column_stack([center, reach])
+    middle, reach = (of_all[target] for of_all in ink_places(pattern))
+    keep = np.column_stack([flat.to_flat(middle[:, :2]), reach])
+    stretch = flat.stretch(keep[:, :2], strained_mm(pattern)[target])
     border = reach[:, None] + (BORDER_MM if outline is None else TAB_MM)
-    corners = np.concatenate([center - border, center + border, *([] if outline is None else [outline])])
+    corners = np.concatenate([keep[:, :2] - border, keep[:, :2] + border, *([] if outline is None else [outline])])
     return Piece(name, target, center, angle, stretch, keep, (), outline, corners.min(axis=0), corners.max(axis=0), flat, anchor, note)
 
 
 def target_ink(pattern: Pattern, piece: Piece, which: int) -> Ink:
-    """The ink of target number `which` of a piece: circles of their true radii, turned as the target is."""
+    """The ink of target number `which` of a piece: circles of their true radii and polygons, turned as the target is."""
     index = int(piece.target[which])
     kind, angle = pattern.kind_of(index), piece.angle_rad[which]
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    return Ink(piece.center_mm[which] + kind.center_mm @ turn.T, kind.radius_mm, name=f"target-{pattern.ids[index]}")
+    polygons = tuple(piece.center_mm[which] + polygon.corners_mm @ turn.T for polygon in kind.polygons)
+    return Ink(piece.center_mm[which] + kind.center_mm @ turn.T, kind.radius_mm, polygons, f"target-{pattern.ids[index]}")
 
 
-def reach_mm(pattern: Pattern) -> Array:
-    """Radius (N,) about each target's origin that holds its ink."""
-    return np.array([kind.extent_mm for kind in (pattern.kinds[name] for name in pattern.kind_names)])
+def ink_places(pattern: Pattern) -> tuple[Array, Array]:
+    """Points (N, 3) in the dish frame and radii (N,) about them that hold each target's own ink; the radius is 0 where there is none.
+
+    The point is the target's origin but for polygons, which may lie beside it.
+    """
+    middle, reach = np.zeros((len(pattern), 2)), np.zeros(len(pattern))
+    for name, kind in pattern.kinds.items():
+        own = np.array([kind_name == name for kind_name in pattern.kind_names])
+        reach[own] = kind.extent_mm
+        if kind.polygons:
+            corners = np.concatenate([polygon.corners_mm for polygon in kind.polygons])
+            middle[own] = (corners.min(axis=0) + corners.max(axis=0)) / 2
+            reach[own] = np.linalg.norm(corners - middle[own][0], axis=1).max()
+    beside = bent_print_mm(middle[:, None], pattern.curvature_per_mm)[:, 0]
+    return pattern.center_mm + np.einsum("nij,nj->ni", pattern.axes, beside), reach
+
+
+def strained_mm(pattern: Pattern) -> Array:
+    """Radius (N,) about the middle of each target's ink within which paper must keep its lengths: of that ink, and half a step of lines."""
+    reach = ink_places(pattern)[1]
+    if not pattern.lines:
+        return reach
+    gap = cKDTree(pattern.center_mm).query(pattern.center_mm, k=[2])[0][:, 0]
+    return np.maximum(reach, gap / 2)

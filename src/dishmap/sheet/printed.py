@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dishmap.errors import InputError
 from dishmap.sheet.pieces import Piece
-from dishmap.targets.pattern import Pattern, TargetKind
+from dishmap.targets.pattern import GridLine, Pattern, Polygon, TargetKind
 
 Array = NDArray[np.float64]
 
@@ -41,7 +41,8 @@ def print_scale(measured_mm: Sequence[float], bar_mm: float) -> Array:
 def printed_pattern(pattern: Pattern, pieces: Sequence[Piece], scale: Array) -> Pattern:
     """The pattern as printed with errors of scale (2,) along the paper's x and y, each piece laid with its anchor in place.
 
-    Places, and the circles' places in their targets, follow both scales; a circle that became an ellipse keeps its area.
+    Places, and the circles' places in their targets, follow both scales; a circle that became an ellipse keeps its area. Polygons and
+    lines follow both scales.
     """
     center, x_axis, normal = pattern.center_mm.copy(), pattern.x_axis.copy(), pattern.normal.copy()
     names = list(pattern.kind_names)
@@ -64,13 +65,33 @@ def printed_pattern(pattern: Pattern, pieces: Sequence[Piece], scale: Array) -> 
         for k, before, after in zip(index, piece.angle_rad, turned, strict=True):
             local = _turn(-after) @ np.diag(scale) @ _turn(before)
             names[k] = _add_kind(kinds, pattern.kind_names[k], _printed_kind(pattern.kind_of(int(k)), local))
-    name = f"{pattern.name} as printed"
-    return replace(pattern, name=name, kinds=kinds, kind_names=tuple(names), center_mm=center, x_axis=x_axis, normal=normal)
+    laid = replace(pattern, kinds=kinds, kind_names=tuple(names), center_mm=center, x_axis=x_axis, normal=normal)
+    return replace(laid, name=f"{pattern.name} as printed", lines=_printed_lines(pattern, pieces, scale))
 
 
 def _printed_kind(kind: TargetKind, local: Array) -> TargetKind:
     center = kind.center_mm @ local.T
-    return TargetKind(np.round(center, 9) + 0.0, kind.radius_mm * np.sqrt(np.linalg.det(local)), kind.dark)
+    polygons = tuple(Polygon(np.round(polygon.corners_mm @ local.T, 9) + 0.0, polygon.dark) for polygon in kind.polygons)
+    return TargetKind(np.round(center, 9) + 0.0, kind.radius_mm * np.sqrt(np.linalg.det(local)), kind.dark, polygons)
+
+
+def _printed_lines(pattern: Pattern, pieces: Sequence[Piece], scale: Array) -> tuple[GridLine, ...]:
+    """Lines with the widths and overhangs that they were printed with: over their targets, in the mean."""
+    if not pattern.lines or pattern.lattice is None:
+        return ()
+    angle = np.zeros(len(pattern))
+    for piece in pieces:
+        angle[piece.target] = piece.angle_rad
+    row = {int(i): k for k, i in enumerate(pattern.ids)}
+    found = []
+    for line in pattern.lines:
+        of = [row[i] for i in line.ids]
+        along_y = bool(np.abs(np.diff(pattern.lattice[of], axis=0)).sum(axis=0).argmax())
+        way = angle[of] + along_y * np.pi / 2
+        # a length along (cos, sin) grows by this, and a width across it by the area's growth over it
+        longer = np.hypot(scale[0] * np.cos(way), scale[1] * np.sin(way))
+        found.append(GridLine(line.ids, line.width_mm * float((scale.prod() / longer).mean()), line.overhang_mm * float(longer.mean())))
+    return tuple(found)
 
 
 def _add_kind(kinds: dict[str, TargetKind], name: str, kind: TargetKind) -> str:
@@ -79,9 +100,14 @@ def _add_kind(kinds: dict[str, TargetKind], name: str, kind: TargetKind) -> str:
     while True:
         called = name if number == 1 else f"{name}~{number}"
         known = kinds.setdefault(called, kind)
-        if known is kind or np.abs(known.center_mm - kind.center_mm).max() < SAME_MM:
+        if known is kind or np.abs(_places(known) - _places(kind)).max(initial=0.0) < SAME_MM:
             return called
         number += 1
+
+
+def _places(kind: TargetKind) -> Array:
+    """Centres of circles and corners of polygons (K, 2)."""
+    return np.concatenate([kind.center_mm, *(polygon.corners_mm for polygon in kind.polygons)])
 
 
 def _turn(angle: float) -> Array:

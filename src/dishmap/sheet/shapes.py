@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -65,10 +66,11 @@ Shape = Ink | Line | Words
 
 @dataclass(frozen=True)
 class Group:
-    """Shapes of which only what lies in clip_mm (left, bottom, right, top) is printed; None prints all."""
+    """Shapes of which only what lies in clip_mm (left, bottom, right, top) and within outline_mm (m, 2) is printed; None prints all."""
 
     shapes: tuple[Shape, ...]
     clip_mm: tuple[float, float, float, float] | None = None
+    outline_mm: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -84,3 +86,13 @@ class Page:
 def cross(at_mm: Array, arm_mm: float) -> tuple[Line, Line]:
     """Two lines that cross at a point (2,)."""
     return tuple(Line(np.array([at_mm - arm, at_mm + arm])) for arm in (np.array([arm_mm, 0.0]), np.array([0.0, arm_mm])))  # type: ignore[return-value]
+
+
+def edge_points(inks: Sequence[Ink], step_mm: float) -> Array:
+    """Points (N, 2) along the edges of polygons, no farther apart than a step."""
+    found = [_no_points()]
+    for polygon in (polygon for ink in inks for polygon in ink.polygons_mm):
+        for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+            count = max(1, int(np.ceil(np.linalg.norm(b - a) / step_mm)))
+            found.append(a + (b - a) * (np.arange(count) / count)[:, None])
+    return np.concatenate(found)

@@ -17,6 +17,7 @@ from dishmap.sheet.markers import marker_polygons
 from dishmap.sheet.paper import Paper
 from dishmap.sheet.pieces import BORDER_MM, Piece, flat_piece, target_ink
 from dishmap.sheet.printed import print_scale, printed_pattern
+from dishmap.sheet.ruled import with_lines
 from dishmap.sheet.shapes import Ink, Page
 from dishmap.sheet.tiles import OVERLAP_MM
 from dishmap.targets.pattern import Pattern
@@ -78,7 +79,7 @@ def pattern_sheets(
     largest_strain: float = LARGEST_STRAIN,
     corner_marks: str | None = None,
 ) -> Sheets:
-    """Sheets of a pattern at true scale: one piece for a plate, cap and gores for a dish.
+    """Sheets of a pattern at true scale: one piece for a plate or an unrolled cylinder, cap and gores for a dish.
 
     corner_marks: `aruco` (4x4_50) or `apriltag` (36h11), numbers 0 to 3 from the upper left clockwise, for plates. Raises
     InputError when a target does not fit on the paper, PatternError when the strain's limit cannot be kept or targets are off the surface.
@@ -93,8 +94,10 @@ def pattern_sheets(
             raise InputError(f"the largest strain must lie between 0 and 100 percent, not {100 * largest_strain:g}")
         pieces = dish_pieces(pattern, largest_strain, (float(paper.room_mm.min()), float(paper.room_mm.max())))
     else:
-        plate = flat_piece(pattern.name or "pattern", pattern, Flat(), np.arange(len(pattern)), None, np.zeros(2))
-        piece, marks = _with_corner_marks(plate, corner_marks)
+        if corner_marks is not None and pattern.surface.kind != "plane":
+            raise InputError("corner marks belong to flat patterns and boards; leave them out for a cylinder")
+        whole = flat_piece(pattern.name or "pattern", pattern, Flat(pattern.surface), np.arange(len(pattern)), None, np.zeros(2))
+        piece, marks = _with_corner_marks(with_lines(whole, pattern), corner_marks)
         pieces = (piece,)
     pages, placements = lay_out(pieces, lambda piece, k: target_ink(pattern, piece, k), paper, pattern.name or "pattern", overlap_mm)
     return Sheets(pattern, _used(paper, pages), pieces, pages, placements, marks)

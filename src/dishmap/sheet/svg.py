@@ -32,9 +32,13 @@ def _group(group: Group, number: int, height: float) -> Iterator[str]:
         yield f'<clipPath id="clip{number}"><rect {box}/></clipPath>'
         clip = f' clip-path="url(#clip{number})"'
     yield f"<g{clip}>"
+    if group.outline_mm is not None:
+        # a clip within a clip: what lies in both is printed
+        yield f'<clipPath id="outline{number}"><path d="M{_points(group.outline_mm, height)}Z"/></clipPath>'
+        yield f'<g clip-path="url(#outline{number})">'
     for shape in group.shapes:
         yield _shape(shape, height)
-    yield "</g>"
+    yield "</g>" if group.outline_mm is None else "</g></g>"
 
 
 def _shape(shape: Shape, height: float) -> str:

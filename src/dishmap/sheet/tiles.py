@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from dishmap.errors import InputError
 from dishmap.sheet.paper import words_of
 from dishmap.sheet.pieces import TAB_MM, Piece
+from dishmap.sheet.shapes import edge_points
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -135,7 +136,7 @@ def _tile(piece: Piece, row: int, column: int, cut_low: Array, cut_high: Array, 
 def _crosses(piece: Piece, edges: list[list[float]]) -> Array:
     """Places (c, 2) on the cuts that are free of ink, at the meetings of cuts and borders and every CROSS_STEP_MM between them."""
     found: list[Array] = []
-    free = _free_of(piece.keep_mm)
+    free = _free_of(piece)
     for axis in (0, 1):
         other = 1 - axis
         along = np.array([*edges[other], *np.arange(edges[other][0], edges[other][-1], CROSS_TRY_MM)])
@@ -151,14 +152,17 @@ def _crosses(piece: Piece, edges: list[list[float]]) -> Array:
     return np.unique(np.round(np.concatenate([np.zeros((0, 2)), *found]), 6), axis=0)
 
 
-def _free_of(keep: Array) -> Callable[[Array], NDArray[np.bool_]]:
+def _free_of(piece: Piece) -> Callable[[Array], NDArray[np.bool_]]:
     """A function that says which places (N, 2) have room for a cross."""
+    keep = piece.keep_mm
     if not len(keep):
         return lambda places: np.ones(len(places), dtype=bool)
+    edges = edge_points(piece.lines, CROSS_ARM_MM / 2)
     tree, reach = cKDTree(keep[:, :2]), keep[:, 2] + CROSS_ARM_MM
 
     def free(places: Array) -> NDArray[np.bool_]:
         near = tree.query_ball_point(places, float(reach.max()))
-        return np.array([all(np.linalg.norm(keep[hits, :2] - p, axis=1) > reach[hits]) for p, hits in zip(places, near, strict=True)])
+        apart = np.array([all(np.linalg.norm(keep[hits, :2] - p, axis=1) > reach[hits]) for p, hits in zip(places, near, strict=True)])
+        return apart & (cKDTree(edges).query(places)[0] > CROSS_ARM_MM) if len(edges) else apart
 
     return free

@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 # A flexible surface moves by millimetres, so marks that differ from symmetry by less than this part of the smallest
 # mark's radius do not tell two poses apart.
 TOLERANCE_OF_RADIUS = 0.2
+# A grid's places differ from symmetry by less than this part of the pitch.
+GRID_TOLERANCE_OF_PITCH = 0.1
 # Normals closer than this are the same: far above rounding, far below what tells two targets on a dish apart.
 NORMAL_TOLERANCE_RAD = 0.05
 # Marks looked at before all others: enough to refuse almost every wrong motion.
@@ -29,8 +31,10 @@ def symmetry_poses(pattern: Pattern, tolerance_mm: float | None = None) -> list[
     tolerance_mm: how far a mark may land from its partner; by default 0.2 of the smallest mark's radius. For a plate and a
     whole dish the motions are turns about z (through the marks' centroid); those of other shapes are found as well. A
     pattern whose marks all lie on one normal (a lone disc) turns freely: that changes no identity and gives no pose here.
-    Sorted by the angle turned.
+    Sorted by the angle turned. A grid's lattice and looks are compared instead of marks.
     """
+    if pattern.is_grid:
+        return _grid_poses(pattern, tolerance_mm)
     marks = pattern.marks
     tolerance = TOLERANCE_OF_RADIUS * float(marks.radius_mm.min()) if tolerance_mm is None else tolerance_mm
     centroid = marks.center_mm.mean(axis=0)
@@ -49,6 +53,31 @@ def symmetry_poses(pattern: Pattern, tolerance_mm: float | None = None) -> list[
         if image is not None and not (image[1] == np.arange(len(image[1]))).all():
             found.setdefault(image[1].tobytes(), image[0])
     return sorted(found.values(), key=lambda pose: float(np.linalg.norm(pose.rotation_vector_rad)))
+
+
+def _grid_poses(pattern: Pattern, tolerance_mm: float | None) -> list[Pose]:
+    """Quarter turns that map a grid's lattice and looks onto themselves, as rigid motions which also map its surface."""
+    assert pattern.lattice is not None
+    # twice the places, about the middle of their box
+    place = 2 * pattern.lattice - pattern.lattice.min(axis=0) - pattern.lattice.max(axis=0)
+    row = {tuple(p): k for k, p in enumerate(place.tolist())}
+    marked = [bool(pattern.lines) and bool(pattern.kind_of(k).polygons) for k in range(len(pattern))]
+    looks = {(x, y, "" if pattern.lines else name) for (x, y), name in zip(place.tolist(), pattern.kind_names, strict=True)}
+    # the mark of a crossing stands in the cell to its upper right
+    looks |= {(x + 1, y + 1, "mark") for (x, y), mark in zip(place.tolist(), marked, strict=True) if mark}
+    pitch = float(cKDTree(pattern.center_mm).query(pattern.center_mm, k=[2])[0].min())
+    centroid = pattern.center_mm.mean(axis=0)
+    centered = pattern.center_mm - centroid
+    found = []
+    for cosine, sine in ((0, 1), (0, -1), (-1, 0)):
+        if {(cosine * x - sine * y, sine * x + cosine * y, look) for x, y, look in looks} != looks:
+            continue
+        image = [row[cosine * x - sine * y, sine * x + cosine * y] for x, y in place.tolist()]
+        turn = _best_turn(centered, centered[image], pattern.normal, pattern.normal[image])
+        off = np.linalg.norm(centered @ turn.T - centered[image], axis=1).max()
+        if off <= (GRID_TOLERANCE_OF_PITCH * pitch if tolerance_mm is None else tolerance_mm):
+            found.append(Pose(turn, centroid - turn @ centroid))
+    return found
 
 
 def _frames(marks: Marks, centroid: Array, tolerance: float) -> tuple[NDArray[np.int64], int, Array] | None:
@@ -99,11 +128,16 @@ def _images(turn: Array, centroid: Array, marks: Marks, tree: cKDTree, tolerance
     """The motion refined over all marks and the mark (M,) on which each lands, or None if it is no symmetry."""
     centered = marks.center_mm - centroid
     _, index = tree.query(centered @ turn.T + centroid)
-    u, _, vt = np.linalg.svd(centered[index].T @ centered + marks.normal[index].T @ marks.normal * float((centered**2).sum(axis=1).mean()))
-    refined = u @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))]) @ vt
+    refined = _best_turn(centered, centered[index], marks.normal, marks.normal[index])
     distance = np.linalg.norm(centered @ refined.T - centered[index], axis=1)
     good = (distance <= tolerance).all() and (marks.type_index[index] == marks.type_index).all()
     same_normal = np.linalg.norm(marks.normal @ refined.T - marks.normal[index], axis=1) <= NORMAL_TOLERANCE_RAD
     if not good or not same_normal.all() or len(np.unique(index)) != len(index):
         return None
     return Pose(refined, centroid - refined @ centroid), np.asarray(index)
+
+
+def _best_turn(start: Array, stop: Array, normal: Array, normal_there: Array) -> Array:
+    """The rotation (3, 3) that best takes centred points (M, 3) and normals to where they go (Kabsch)."""
+    u, _, vt = np.linalg.svd(stop.T @ start + normal_there.T @ normal * float((start**2).sum(axis=1).mean()))
+    return np.asarray(u @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))]) @ vt)
