@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from dishmap.surface.fit import Basis, fit_surface
     from dishmap.targets.builders import dish, plate
     from dishmap.targets.detect import find_ellipses
+    from dishmap.targets.grid_builders import grid
     from dishmap.targets.identify import PoseGuess, Upright, identify
     from dishmap.targets.pattern import Pattern, Surface, TargetKind
     from dishmap.targets.pose import measure_targets
@@ -79,6 +80,7 @@ _HOME = {
     "find_boards": "dishmap.camera.chessboard",
     "find_ellipses": "dishmap.targets.detect",
     "fit_surface": "dishmap.surface.fit",
+    "grid": "dishmap.targets.grid_builders",
     "identify": "dishmap.targets.identify",
     "map_photograph": "dishmap.pipeline",
     "measure_targets": "dishmap.targets.pose",
@@ -134,6 +136,7 @@ __all__ = [
     "find_boards",
     "find_ellipses",
     "fit_surface",
+    "grid",
     "identify",
     "map_photograph",
     "measure_targets",

@@ -30,6 +30,8 @@ from dishmap.io.scenario_file import read_scenario
 from dishmap.io.truth_file import read_truth
 from dishmap.simulate.scenario import simulate_states
 from dishmap.targets.builders import KIND_BUILDERS
+from dishmap.targets.grid_builders import SURFACE_NAMES
+from dishmap.targets.pattern import Surface
 from dishmap.targets.symmetry import symmetry_poses
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -69,6 +71,7 @@ def test_version_and_the_installed_name() -> None:
 
 def test_words_are_those_of_the_functions() -> None:
     assert set(pattern.KINDS) == set(KIND_BUILDERS)
+    assert list(pattern.SURFACES) == list(SURFACE_NAMES)
     assert set(calibrate_words.LENSES.values()) == set(LENSES)
 
 
@@ -128,6 +131,45 @@ def test_dish_pattern_with_marks(tmp_path: Path) -> None:
     radius = np.hypot(made.center_mm[:, 0], made.center_mm[:, 1])
     assert (radius.min(), radius.max()) == (pytest.approx(60), pytest.approx(240))
     assert symmetry_poses(made) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "surface", "said"),
+    [
+        (["--line-mm", 1, "--orientation-marks"], Surface(), "crossing, crossing-marked"),
+        (["--square-mm", 8], Surface(), "looks the same after 1 turn"),
+        (["--square-mm", 8, "--surface", "cylinder", "--cylinder-radius-mm", -80], Surface("cylinder", radius_mm=-80.0), "(square)"),
+        (
+            ["--line-mm", 1, "--surface", "dish", "--diameter-mm", 300, "--focal-length-mm", 150],
+            Surface("paraboloid", 300.0, 150.0),
+            "a photograph of a part of it could be of any part",
+        ),
+    ],
+)
+def test_grid_patterns(words: list[object], surface: Surface, said: str, tmp_path: Path) -> None:
+    out = tmp_path / "grid.json"
+    done = dishmap("pattern", "grid", "--columns", 8, "--rows", 7, "--pitch-mm", 12, *words, "--out", out)
+    assert done.exit_code == 0, done.output
+    assert said in " ".join(done.stdout.split())
+    made = read_pattern(out)
+    assert (len(made), made.surface, made.is_grid) == (56, surface, True)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "give --line-mm or --square-mm"),
+        (["--line-mm", 1, "--square-mm", 3], "and not both"),
+        (["--line-mm", 1, "--surface", "dish", "--diameter-mm", 300], "--surface dish needs --focal-length-mm"),
+        (["--line-mm", 1, "--cylinder-radius-mm", 57], "--surface plane does not take --cylinder-radius-mm"),
+        (["--line-mm", 6], "too wide for a pitch of 12 mm"),
+    ],
+)
+def test_grid_pattern_mistakes(words: list[object], said: str, tmp_path: Path) -> None:
+    done = dishmap("pattern", "grid", "--columns", 8, "--rows", 7, "--pitch-mm", 12, *words, "--out", tmp_path / "grid.json")
+    assert done.exit_code == 2
+    assert said in done.stderr
+    assert not list(tmp_path.iterdir())
 
 
 def test_pattern_mistakes(tmp_path: Path) -> None:

@@ -32,11 +32,12 @@ def dishmap(*words: object) -> Result:
     return runner.invoke(program, [str(word) for word in words])
 
 
-def rendered(pdf: Path, dpi: int) -> list[NDArray[np.uint8]]:
-    """Every page of a PDF file as a grey picture."""
+def rendered(pdf: Path, dpi: int, snapped: bool = True) -> list[NDArray[np.uint8]]:
+    """Every page of a PDF file as a grey picture; snapped: poppler's own renderer, which moves upright rectangles to whole pixels."""
     folder = pdf.parent / f"rendered-{dpi}"
     folder.mkdir()
-    subprocess.run(["pdftoppm", "-r", str(dpi), "-gray", str(pdf), str(folder / "page")], check=True)
+    program = ["pdftoppm"] if snapped else ["pdftocairo", "-png"]
+    subprocess.run([*program, "-r", str(dpi), "-gray", str(pdf), str(folder / "page")], check=True)
     return [np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path in sorted(folder.iterdir())]
 
 
@@ -47,7 +48,7 @@ def on_paper_mm(pixels: Array, dpi: int, height_mm: float) -> Array:
 
 
 class SvgPage:
-    """The geometry of an SVG page in mm from the lower left corner: circles of every named ink, lines, words."""
+    """The geometry of an SVG page in mm from the lower left corner: circles and polygons of every named ink, lines, words."""
 
     def __init__(self, path: Path) -> None:
         root = ElementTree.parse(path).getroot()
@@ -56,16 +57,21 @@ class SvgPage:
         assert root.attrib["viewBox"] == f"0 0 {root.attrib['width'][:-2]} {root.attrib['height'][:-2]}"
         height = self.size_mm[1]
         self.circles: dict[str, Array] = {}
+        self.polygons: dict[str, list[Array]] = {}
         self.lines: list[Array] = []
         for shape in root.iter(f"{space}path"):
             d = shape.attrib["d"]
-            if shape.attrib["fill"] == "none":
+            if shape.attrib.get("fill") == "none":
                 points = np.array([[float(v) for v in pair.split(",")] for pair in d[1:].split()])
                 self.lines.append(np.stack([points[:, 0], height - points[:, 1]], axis=1))
             elif " A" in d:
                 found = re.findall(r"M([\d.-]+),([\d.-]+) A([\d.]+),", d)
                 rows = [(float(x) + float(r), height - float(y), float(r)) for x, y, r in found]
                 self.circles[shape.attrib["id"]] = np.array(rows)
+            elif "id" in shape.attrib:
+                for part in d.split("Z")[:-1]:
+                    points = np.array([[float(v) for v in pair.split(",")] for pair in part.strip()[1:].split()])
+                    self.polygons.setdefault(shape.attrib["id"], []).append(np.stack([points[:, 0], height - points[:, 1]], axis=1))
         self.words = [str(text.text) for text in root.iter(f"{space}text")]
 
 

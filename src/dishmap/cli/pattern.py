@@ -193,14 +193,22 @@ def _word(name: str) -> str:
 def _write(pattern: Pattern, out: Path) -> None:
     from dishmap.io.atomic import output_folder
     from dishmap.io.pattern_file import write_pattern
-    from dishmap.targets.symmetry import symmetry_poses
 
     with output_folder(out.parent):
         write_pattern(out, pattern)
     say(f"{out}: {len(pattern)} targets ({', '.join(pattern.kinds)})")
+    say_identity(pattern)
+
+
+def say_identity(pattern: Pattern) -> None:
+    """Say what a photograph of the pattern would leave open."""
+    from dishmap.targets.symmetry import symmetry_poses
+
     same = len(symmetry_poses(pattern))
     if same:
         say(
             f"  the pattern looks the same after {same} turn{'s' * (same > 1)}, so `dishmap map` needs --upright or --pose-guess; "
             "--orientation-marks avoids that"
         )
+    if pattern.is_grid and len(pattern.kinds) == 1:
+        say("  the grid is uniform, and a photograph of a part of it could be of any part; --orientation-marks avoids that too")

@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dishmap.cli.options import PATH, POSITIVE, F, Grid, Number, Numbers, out_folder, refuse_overwriting
-from dishmap.cli.pattern import PatternGroup, dish_command, dish_of, grid_command, grid_of, own_options, pattern_in, plate_command, plate_of
+from dishmap.cli.pattern import (
+    PatternGroup,
+    dish_command,
+    dish_of,
+    grid_command,
+    grid_of,
+    own_options,
+    pattern_in,
+    plate_command,
+    plate_of,
+    say_identity,
+)
 from dishmap.cli.terminal import say
 
 if TYPE_CHECKING:
@@ -236,7 +247,6 @@ def _say_cuts(sheets: Sheets, board: bool) -> None:
 
 def _say_identity(sheets: Sheets) -> None:
     from dishmap.targets.pattern import Pattern
-    from dishmap.targets.symmetry import symmetry_poses
 
     if not isinstance(sheets.what, Pattern):
         if sheets.what.dictionary is None and sheets.what.corners[0] == sheets.what.corners[1]:
@@ -244,8 +254,5 @@ def _say_identity(sheets: Sheets) -> None:
                 "  the board looks the same after a quarter turn, so a printer that is uneven along x and y cannot be allowed for; "
                 "take more corners one way"
             )
-    elif same := len(symmetry_poses(sheets.what)):
-        say(
-            f"  the pattern looks the same after {same} turn{'s' * (same > 1)}, so `dishmap map` needs --upright or --pose-guess; "
-            "orientation marks avoid that"
-        )
+    else:
+        say_identity(sheets.what)

@@ -32,10 +32,11 @@ def with_lines(piece: Piece, pattern: Pattern, ground_mm: Array | None = None) -
     for number in range(len(pattern.lines)):
         start, stop = lines.start_t[number], lines.stop_t[number]
         t = np.concatenate([[start], np.arange(np.floor(start / STEP) + 1, np.ceil(stop / STEP)) * STEP, [stop]])
-        for run in _runs(lines.points_mm(number, t)[:, :2], ground_mm):
+        for again, run in enumerate(_runs(lines.points_mm(number, t)[:, :2], ground_mm)):
             half = lines.width_mm[number] / 2
             edges = [lines.points_mm(number, t[run], across)[:, :2] for across in (-half, half)]
-            inks.append(Ink(polygons_mm=(piece.map.to_flat(np.concatenate([edges[0], edges[1][::-1]])),), name=f"line-{number}"))
+            name = f"line-{number}" + ("" if ground_mm is None else f"-{piece.name.replace(' ', '-')}" + f"-{again}" * bool(again))
+            inks.append(Ink(polygons_mm=(piece.map.to_flat(np.concatenate([edges[0], edges[1][::-1]])),), name=name))
     if ground_mm is not None:
         return replace(piece, lines=tuple(inks))
     corners = np.concatenate([ink.polygons_mm[0] for ink in inks])
