@@ -32,7 +32,7 @@ def clear_of_ends(shapes: NodeShapes, maps: LatticeMaps, reach_px: float) -> Nod
 
 
 def arms_there(pixels: NodePixels, light: Array, cover: NDArray[Any], x: Array, blur_px: float) -> Bool:
-    """Where (n, 2, 2) the arm of each band on its negative and positive side shows ink, by light levels (n, 4) and coverage at x (n, G)."""
+    """Where (n, 2, 2) the arm of each band on its negative and positive side shows ink, by what `levels_at` says at x (n, G)."""
     single = light.astype(np.float32)
     ground = single[:, :1] + single[:, 1:2] * pixels.s + single[:, 2:3] * pixels.t
     depth = (ground - pixels.grey) * pixels.used

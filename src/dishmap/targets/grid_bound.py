@@ -59,7 +59,7 @@ def grid_bound(
         x[:, HALF], x[:, BLUR] = print_.half, blur
         if size == NESTED:
             x[:, INNER] = print_.inner
-        pixels = node_pixels(dark, some, clear_of_ends(print_, some, reach), print_.half, reach, coarse=False)
+        pixels = node_pixels(dark, some, clear_of_ends(print_, some, reach), print_.half, reach)
         columns = np.zeros((len(rows), size + LIGHT, pixels.s.shape[1]), np.float32)
         cover = coverage(pixels, x, shapes.crossing, columns[:, :size])
         columns[:, :size] *= -contrast_to_noise

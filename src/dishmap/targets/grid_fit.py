@@ -30,8 +30,9 @@ HELD, PLAIN, NESTED = 5, 9, 11
 LIGHT = 4
 # No edge is felt beyond.
 FARTHEST_BLURS = np.float32(6.0)
-# Nearly upright crossings need no correction for the angle between bands.
-UPRIGHT = 0.005
+# Bands nearly at right angles need no correction for the angle between them; crossings hardly, as what is left out is the same on both
+# sides of the middle.
+UPRIGHT, UPRIGHT_CROSSING = 0.005, 0.05
 LARGEST_STEP_PX, LARGEST_PART = 1.0, 0.3
 SHARPEST_PX, WIDEST_PX = 0.35, 10.0
 # Settled when what a Gauss-Newton step leaves to do is a small part of sigma, or of a pixel: see `targets.adjust`.
@@ -136,7 +137,7 @@ def _band(pixels: NodePixels, x: Array, band: int, half: Array) -> tuple[Single,
     return low, bell_high, by_half, z_low
 
 
-def _meeting(pixels: NodePixels, x: Array, bands: Sequence[tuple[Single, ...]]) -> Single:
+def _meeting(pixels: NodePixels, x: Array, bands: Sequence[tuple[Single, ...]], upright: float = UPRIGHT) -> Single:
     """Coverage (n, P) common to two bands.
 
     Two half planes under one round blur are a bivariate normal distribution whose correlation is the cosine between their normals; the
@@ -144,7 +145,7 @@ def _meeting(pixels: NodePixels, x: Array, bands: Sequence[tuple[Single, ...]]) 
     """
     (one, one_offset, _, one_blur), (two, two_offset, _, two_blur) = bands
     both = one * two
-    if np.abs(pixels.skew).max(initial=0) > UPRIGHT:
+    if np.abs(pixels.skew).max(initial=0) > upright:
         first = one_offset * two_offset
         first /= pixels.scale[0]
         first /= pixels.scale[1]
@@ -161,7 +162,7 @@ def _meeting(pixels: NodePixels, x: Array, bands: Sequence[tuple[Single, ...]]) 
 def coverage(pixels: NodePixels, x: Array, crossing: bool, out: Single) -> Single:
     """Ink coverage (n, P) of all nodes and its derivative by the parameters, put into `out` (n, G, P)."""
     bands = [_band(pixels, x, k, x[:, HALF][:, k]) for k in (0, 1)]
-    cover = _meeting(pixels, x, bands)
+    cover = _meeting(pixels, x, bands, UPRIGHT_CROSSING if crossing else UPRIGHT)
     if crossing:
         np.subtract(bands[0][0], cover, out=cover)
         cover += bands[1][0]
@@ -224,26 +225,27 @@ def solve_light(rows: Single, weight: Single) -> Array:
 
 
 def levels_at(pixels: NodePixels, x: Array, ink_share: Array, crossing: bool) -> tuple[Array, Single, Single]:
-    """Best light levels (n, LIGHT) at given parameters, the residuals and the coverage (n, P) there."""
+    """Best light levels (n, LIGHT) at given parameters, the coverage and the residuals (n, P) there."""
     every = np.empty((len(x), LIGHT + 1, pixels.s.shape[1]), np.float32)
     cover = coverage(pixels, x, crossing, np.empty((len(x), x.shape[1], pixels.s.shape[1]), np.float32))
     light_rows(pixels, cover, ink_share, every)
     every[:, -1] = pixels.grey
     light = solve_light(every, pixels.used.astype(np.float32))
-    return light, pixels.grey - (light[:, None].astype(np.float32) @ every[:, :-1])[:, 0], cover
+    return light, cover, pixels.grey - (light[:, None].astype(np.float32) @ every[:, :-1])[:, 0]
 
 
 def one_step(
-    pixels: NodePixels, x: Array, ink_share: Array, priors: NodePriors, weights: Weights, crossing: bool, before: Single | None = None
+    pixels: NodePixels, x: Array, ink_share: Array, priors: NodePriors, weights: Weights, crossing: bool, light: Array | None = None
 ) -> NodeFit:
-    """One pass over the pixels of n nodes and one Gauss-Newton step; before (n, P): robust weights of the pass before."""
+    """One pass over the pixels of n nodes and one Gauss-Newton step; light (n, LIGHT): levels to start from, the best ones if None."""
     count, size = x.shape
     every = np.empty((count, size + LIGHT + 1, pixels.s.shape[1]), np.float32)
     cover = coverage(pixels, x, crossing, every[:, :size])
     light_rows(pixels, cover, ink_share, every[:, size:])
     every[:, -1] = pixels.grey
     used = pixels.used.astype(np.float32)
-    light = solve_light(every[:, size:], used if before is None else before)
+    if light is None:
+        light = solve_light(every[:, size:], used)
     single = light.astype(np.float32)
     model = (single[:, None] @ every[:, size:-1])[:, 0]
     residual = np.subtract(pixels.grey, model)
@@ -253,28 +255,50 @@ def one_step(
     contrast *= (np.asarray(ink_share, np.float32) - 1)[:, None]
     contrast += single[:, 3:4] - single[:, :1]
     robust = used if weights.cut is None else _tapered(residual, _cut(residual, used, variance, light, weights), used)
-    edge = np.abs(every[:, 0]) / np.maximum(pixels.scale[0], TINY) + np.abs(every[:, 1]) / np.maximum(pixels.scale[1], TINY)
-    seen = (edge * robust).sum(axis=1)
-    kept, whole = (seen / np.maximum((edge * some).sum(axis=1), TINY) for some in (pixels.expected, used))
+    shares = _shares(pixels, every, robust, used) if weights.known else (np.ones(count), np.ones(count))
     root = np.sqrt(robust / variance)
     every[:, -1] = residual
     contrast *= root
     every[:, :size] *= contrast[:, None]
     every[:, size:] *= root[:, None]
-    sums = (every @ np.swapaxes(every, 1, 2)).astype(float)
+    # not a product of one array with itself, for which a routine is called that is several times slower on small matrices
+    sums = (every[:, :-1] @ np.swapaxes(every, 1, 2)).astype(float)
     weight = robust.sum(axis=1, dtype=float)
     noise = np.ones(count)
     if not weights.known:
-        noise = np.maximum(sums[:, -1, -1] / np.maximum(weight - size - LIGHT, 1.0), 1e-9)
+        noise = np.maximum(np.einsum("np,np->n", every[:, -1], every[:, -1]) / np.maximum(weight - size - LIGHT, 1.0), 1e-9)
     delta, sigmas = _solved(sums, x, priors, noise)
     new, converged = _moved(pixels, x, delta[:, :size], sigmas)
     white = every[:, -1] - (delta[:, None].astype(np.float32) @ every[:, :-1])[:, 0]
     square = np.einsum("np,np->n", white, white).astype(float)
+    light = light + delta[:, size:]
     ratio = np.clip(light[:, 3] / np.maximum(light[:, 0], 1e-3), *INK_SHARES)
-    beforehand = (priors.precision, priors.mean)
-    shares = (kept.astype(float), whole.astype(float))
-    fields = (new, ratio, light, sums[:, :-1, :-1], *beforehand, converged, weight, square, *shares)
-    return NodeFit(*fields, residual, model, robust, cover, white)
+    return NodeFit(
+        x=new,
+        ink_share=ratio,
+        light=light,
+        normal=sums[:, :, :-1],
+        prior=priors.precision,
+        mean=priors.mean,
+        converged=converged,
+        weight=weight,
+        square=square,
+        kept=shares[0],
+        whole=shares[1],
+        residual=residual,
+        model=model,
+        robust=robust,
+        cover=cover,
+        white=white,
+    )
+
+
+def _shares(pixels: NodePixels, columns: Single, robust: Single, used: Single) -> tuple[Array, Array]:
+    """Shares (n,) of the edges' length that were used: of all, and of what was looked at."""
+    edge = np.abs(columns[:, 0]) / np.maximum(pixels.scale[0], TINY) + np.abs(columns[:, 1]) / np.maximum(pixels.scale[1], TINY)
+    seen = (edge * robust).sum(axis=1)
+    kept, whole = (seen / np.maximum((edge * some).sum(axis=1), TINY) for some in (pixels.expected, used))
+    return kept.astype(float), whole.astype(float)
 
 
 def _cut(residual: Single, used: Single, variance: Single, light: Array, weights: Weights) -> Single:
@@ -295,7 +319,7 @@ def _tapered(residual: Single, cut: Single, used: Single) -> Single:
 def _solved(sums: Array, x: Array, priors: NodePriors, noise: Array) -> tuple[Array, Array]:
     """Step (n, G + LIGHT) of the parameters and the light, and its size in sigmas of them (n,)."""
     size = x.shape[1]
-    normal, right = sums[:, :-1, :-1] / noise[:, None, None], sums[:, :-1, -1] / noise[:, None]
+    normal, right = sums[:, :, :-1] / noise[:, None, None], sums[:, :, -1] / noise[:, None]
     normal[:, :size, :size] += priors.precision
     normal[:, range(size, size + LIGHT), range(size, size + LIGHT)] *= 1 + 1e-9
     right[:, :size] -= (priors.precision @ (x - priors.mean)[..., None])[..., 0]

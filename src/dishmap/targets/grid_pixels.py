@@ -91,10 +91,10 @@ def strips_of(shapes: NodeShapes, half: Array, maps: LatticeMaps, reach_px: floa
     return out
 
 
-def node_pixels(image: NDArray[Any], maps: LatticeMaps, shapes: NodeShapes, half: Array, reach_px: float, coarse: bool) -> NodePixels:
-    """Pixels of n nodes within `reach_px` of edges; half (n, 2): half widths in lattice units; coarse: every fourth pixel."""
+def node_pixels(image: NDArray[Any], maps: LatticeMaps, shapes: NodeShapes, half: Array, reach_px: float, every: int = 1) -> NodePixels:
+    """Pixels of n nodes within `reach_px` of edges; half (n, 2): half widths in lattice units; every: all pixels, or each 4th or 8th."""
     strips = strips_of(shapes, half, maps, reach_px)
-    places = [_strip_places(maps, strip, reach_px, coarse) for strip in strips]
+    places = [_strip_places(maps, strip, reach_px, every) for strip in strips]
     u, v, listed = (np.concatenate([place[i] for place in places], axis=1) for i in (0, 1, 2))
     scale = maps.scale_px[:, None]
     s, t = ((x - maps.origin_px[:, i : i + 1]) / scale for i, x in ((0, u), (1, v)))
@@ -109,8 +109,11 @@ def node_pixels(image: NDArray[Any], maps: LatticeMaps, shapes: NodeShapes, half
     return NodePixels(across, per_unit, s, t, maps.scale_px, grey, expected, expected & inside & ~full, share, skew, bend, curve)
 
 
-def _strip_places(maps: LatticeMaps, strip: Strip, reach_px: float, coarse: bool) -> tuple[NDArray[np.int32], NDArray[np.int32], Bool]:
-    """Pixels u, v (n, P) that hold the strip, block by block of 2x2 neighbours, and which are no padding; coarse: one of each block."""
+def _strip_places(maps: LatticeMaps, strip: Strip, reach_px: float, every: int) -> tuple[NDArray[np.int32], NDArray[np.int32], Bool]:
+    """Pixels u, v (n, P) that hold the strip, block by block of 2x2 neighbours, and which are no padding.
+
+    every: 4 or 8 for one pixel of each block, or of each second.
+    """
     along = np.stack([strip.start, 0.5 * (strip.start + strip.end), strip.end], axis=1)
     level = np.broadcast_to(strip.level[:, None], along.shape)
     ab = np.stack([along, level] if strip.band == 0 else [level, along], axis=-1)
@@ -128,20 +131,20 @@ def _strip_places(maps: LatticeMaps, strip: Strip, reach_px: float, coarse: bool
     thick = (1.1 * strip.half * across + reach_px) * lean + 0.5 * np.abs(slope)
     length = 2 * int(np.ceil(0.5 * (min(float((last - first).max()), LONGEST_STRIP_PX) + 1)))
     width = 2 * int(np.ceil(min(float(thick.max()), WIDEST_STRIP_PX)))
-    pair = first[:, None] + np.arange(0, length, 2)
+    pair = first[:, None] + np.arange(0, length, 4 if every == 8 else 2)
     x = (pair + 0.5 - major[:, :1]) / gap[:, None]
     middle = minor[:, :1] + slope[:, None] * (pair + 0.5 - major[:, :1]) + 4 * sag[:, None] * x * (1 - x)
-    low = np.round(middle - 0.5 * (width - 1))
+    low, pair = np.round(middle - 0.5 * (width - 1)).astype(np.int32), pair.astype(np.int32)
     # corners of blocks of 2x2 (n, pairs along, pairs across), and those of them that may hold pixels of the strip
-    one = low[..., None] + np.arange(0, width, 2)
+    one = low[..., None] + np.arange(0, width, 2, dtype=np.int32)
     near = (np.abs(one + 0.5 - middle[..., None]) < thick[:, None, None] + 0.5) & (pair <= last[:, None])[..., None]
     two = np.broadcast_to(pair[..., None], one.shape)
-    if coarse:
+    if every > 1:
         # pixels of odd and even lines in turn, so that an edge along a line of pixels is not missed
-        one = one + (np.arange(length // 2) % 2)[:, None]
+        one = one + (np.arange(pair.shape[1], dtype=np.int32) % 2)[:, None]
     block, used = places_of(near.reshape(len(first), -1))
-    one, two = (np.take_along_axis(x.reshape(len(first), -1), block, axis=1).astype(np.int32) for x in (one, two))
-    if not coarse:
+    one, two = (np.take_along_axis(x.reshape(len(first), -1), block, axis=1) for x in (one, two))
+    if every == 1:
         square = (*one.shape, 4)
         one = np.broadcast_to(one[..., None] + np.array(ROW, np.int32), square).reshape(len(first), -1)
         two = np.broadcast_to(two[..., None] + np.array(COLUMN, np.int32), square).reshape(len(first), -1)

@@ -52,6 +52,8 @@ Index = NDArray[np.int64]
 
 # How well places are known before the fit, and at best lie on a smooth map.
 FIRST_SIGMA_PX, LEAST_SIGMA_PX = 0.2, 1e-3
+# What nodes may stray by through other things than noise: in the coarse fit, and in the end.
+COARSE_SIGMA_PX, MODEL_SIGMA_PX = 0.05, 0.01
 # A photograph more blurred than this is fitted coarsely once more, for its own blur.
 BLURRED_PX = 1.6
 # Widths below which the model of edges says little: a line, and the side of a rectangle.
@@ -137,7 +139,7 @@ def _measure(image: NDArray[Any], pattern: Pattern, shapes: NodeShapes, index: I
     moved = np.where(good[:, None], moved, maps.origin_px)
     sigma = place_sigma_px(lattice, moved, good, LEAST_SIGMA_PX)
     # what stands in the way may have led a node astray: it is looked for again where its neighbours say
-    astray, expected = strays(lattice, moved, good, sigma, np.zeros(len(moved)))
+    astray, expected = strays(lattice, moved, good, sigma, np.full(len(moved), COARSE_SIGMA_PX))
     moved[astray] = expected[astray]
     measurable, good = good, good & ~astray
     maps = lattice_maps(lattice, moved, good, sigma)
@@ -211,7 +213,7 @@ def _collect(
     bits[(lost & bright) | (stage.saturated > MOST_SATURATED)] |= int(Quality.GLARE)
     bits[lost & ~bright] |= int(Quality.OCCLUDED)
     covariance = inverse_each(np.where(finite[:, None, None], information, 0.0))
-    own = np.sqrt(np.maximum(covariance[:, 0, 0] + covariance[:, 1, 1], 0.0) / 2)
+    own = np.sqrt(np.maximum(covariance[:, 0, 0] + covariance[:, 1, 1], 0.0) / 2 + MODEL_SIGMA_PX**2)
     assert pattern.lattice is not None
     astray, expected = strays(pattern.lattice[index], y[:, :2], ~is_rejected(bits), sigma_px, own)
     for i in np.flatnonzero(astray):

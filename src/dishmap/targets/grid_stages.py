@@ -40,8 +40,9 @@ Index = NDArray[np.int64]
 
 # Nodes whose pixels together stay in the processor's cache.
 COARSE_AT_ONCE, FULL_AT_ONCE = 160, 48
-# Nodes that lie closer have too few pixels to leave any out.
-COARSE_STEP_PX = 20.0
+NOISE_CHUNKS = 8
+# Nodes that lie closer have too few pixels to leave any out, or more than three of four.
+COARSE_STEPS_PX = (16.0, 26.0)
 # Edges are felt this far, in blurs and px; what is looked at before the blur is known.
 REACH_BLURS, REACH_EXTRA_PX = 2.5, 0.5
 FIRST_BLUR_PX, FIRST_REACH_PX = 1.2, 3.5
@@ -186,12 +187,12 @@ def first_guess(image: NDArray[Any], maps: LatticeMaps, shapes: NodeShapes) -> L
     maps, shapes = maps.take(some), shapes.take(some)
     step = np.linalg.norm(maps.step_px, axis=1)[:, ::-1]
     reach = FIRST_REACH_PX + (1 - GUESS_RATIOS[0]) * float(np.median(shapes.half * step))
-    pixels = node_pixels(image, maps, clear_of_ends(shapes, maps, reach), shapes.half, reach, coarse=True)
+    pixels = node_pixels(image, maps, clear_of_ends(shapes, maps, reach), shapes.half, reach, 4)
     left = []
     for ratio in GUESS_RATIOS:
         guess = Learnt(FIRST_BLUR_PX, FIRST_LOG_BLUR, np.full(2, ratio), FIRST_LOG_HALF, NoiseModel(1.0, 0.0, 1.0))
         x = _start(priors_of(maps, shapes, guess, held=True))
-        _, residual, _ = levels_at(pixels, x, np.full(len(some), FIRST_INK_SHARE), shapes.crossing)
+        _, _, residual = levels_at(pixels, x, np.full(len(some), FIRST_INK_SHARE), shapes.crossing)
         left.append((guess, float(np.median((residual**2 * pixels.used).sum(axis=1)))))
     return min(left, key=lambda guess: guess[1])[0]
 
@@ -199,28 +200,28 @@ def first_guess(image: NDArray[Any], maps: LatticeMaps, shapes: NodeShapes) -> L
 def _coarse_chunk(
     image: NDArray[Any], maps: LatticeMaps, shapes: NodeShapes, first: Learnt, reach_px: float
 ) -> tuple[Stage, NodeFit, NodePixels]:
-    priors = priors_of(maps, shapes, first, held=True)
+    priors, step_px = priors_of(maps, shapes, first, held=True), float(np.median(np.linalg.norm(maps.step_px, axis=1).min(axis=1)))
     x, share = _start(priors), np.full(len(shapes.half), FIRST_INK_SHARE)
-    coarse = np.median(np.linalg.norm(maps.step_px, axis=1)) > COARSE_STEP_PX
-    pixels = node_pixels(image, maps, clear_of_ends(shapes, maps, reach_px), x[:, HALF], reach_px, coarse=bool(coarse))
+    every = 1 if step_px < COARSE_STEPS_PX[0] else 4 if step_px < COARSE_STEPS_PX[1] else 8
+    pixels = node_pixels(image, maps, clear_of_ends(shapes, maps, reach_px), x[:, HALF], reach_px, every)
     weights = Weights(1.0, 0.0, None, known=False)
     there = np.ones((len(x), 2, 2), bool)
     if shapes.crossing:
         # one step brings lines under the model; what misled it is then seen and left out
         nearer = one_step(pixels, x, share, priors, weights, shapes.crossing).x
-        light, _, cover = levels_at(pixels, nearer, share, shapes.crossing)
-        there = arms_there(pixels, light, cover, nearer, first.blur_px)
+        levels, cover, _ = levels_at(pixels, nearer, share, shapes.crossing)
+        there = arms_there(pixels, levels, cover, nearer, first.blur_px)
         whole = there.all(axis=(1, 2))
         x[whole] = nearer[whole]
         pixels = without_arms(pixels, x, there, reach_px)
-    before = None
+    light = None
     for step in range(COARSE_STEPS):
-        fit = one_step(pixels, x, share, priors, weights, shapes.crossing, before)
-        x, share = fit.x, fit.ink_share
+        fit = one_step(pixels, x, share, priors, weights, shapes.crossing, light)
+        x, share, light = fit.x, fit.ink_share, fit.light
         if step >= FREE_STEPS - 1:
             some = np.abs(fit.residual[fit.robust > 0])
             sigma = ROBUST_TO_SIGMA * float(np.median(some)) if len(some) else 1.0
-            weights, before = Weights(max(sigma, 0.05) ** 2, 0.0, CUT), fit.robust
+            weights = Weights(max(sigma, 0.05) ** 2, 0.0, CUT)
             if x.shape[1] == HELD:
                 # near enough for lines to find their own direction, as far as the neighbours leave it open
                 x, priors = np.pad(x, ((0, 0), (0, PLAIN - HELD))), priors_of(maps, shapes, first)
@@ -266,6 +267,8 @@ def full_stage(image: NDArray[Any], maps: LatticeMaps, shapes: NodeShapes, coars
     size = stage.x.shape[1] + LIGHT
     good = stage.converged & (stage.weight > 2 * size)
     ratio = float(np.median(stage.square[good] / (stage.weight[good] - size))) if good.any() else 1.0
+    # some of them know it well enough
+    white = white[:: max(1, len(white) // NOISE_CHUNKS)]
     inflation = inflation_of([w for w, _ in white], [u for _, u in white])
     noise = NoiseModel(learnt.noise.base * ratio, learnt.noise.slope * ratio, inflation)
     return replace(stage, normal=stage.normal / ratio, square=stage.square / ratio), noise
@@ -279,11 +282,11 @@ def _full_chunk(
     x[:, [*range(HALF.start, HALF.stop), BLUR]] = coarse.x[:, [*range(HALF.start, HALF.stop), BLUR]]
     if not shapes.crossing:
         x[:, SLOPE], x[:, INNER] = coarse.x[:, SLOPE], coarse.x[:, INNER]
-    pixels = node_pixels(image, maps, clear_of_ends(shapes, maps, learnt.reach_px), x[:, HALF], learnt.reach_px, coarse=False)
+    pixels = node_pixels(image, maps, clear_of_ends(shapes, maps, learnt.reach_px), x[:, HALF], learnt.reach_px)
     if shapes.crossing:
         pixels = without_arms(pixels, x, coarse.there, learnt.reach_px)
     weights = Weights(learnt.noise.base, learnt.noise.slope, CUT)
-    fit = one_step(pixels, x, coarse.ink_share, priors, weights, shapes.crossing)
+    fit = one_step(pixels, x, coarse.ink_share, priors, weights, shapes.crossing, coarse.light)
     stage, white, used = _stage(fit, coarse.there, pixels), fit.white, fit.robust > 0
     before = fit.robust.copy()
     rest = np.flatnonzero(~fit.converged)
@@ -292,7 +295,7 @@ def _full_chunk(
             break
         some = pixels.take(np.isin(np.arange(len(x)), rest))
         own = NodePriors(priors.mean[rest], priors.precision[rest])
-        fit = one_step(some, stage.x[rest], stage.ink_share[rest], own, weights, shapes.crossing, before[rest])
+        fit = one_step(some, stage.x[rest], stage.ink_share[rest], own, weights, shapes.crossing, stage.light[rest])
         part = _stage(fit, coarse.there[rest], some)
         for name in Stage.__dataclass_fields__:
             getattr(stage, name)[rest] = getattr(part, name)
@@ -322,10 +325,10 @@ def _clear_of_obstacles(
             used[k] &= far > OBSTACLE_BLURS * stage.x[row, BLUR] + 1.0
     clear = replace(some, used=used)
     own = NodePriors(priors.mean[rows], priors.precision[rows])
-    x, share = stage.x[rows], stage.ink_share[rows]
+    x, share, light = stage.x[rows], stage.ink_share[rows], None
     for _ in range(FREE_STEPS + 1):
-        fit = one_step(clear, x, share, own, weights, crossing)
-        x, share = fit.x, fit.ink_share
+        fit = one_step(clear, x, share, own, weights, crossing, light)
+        x, share, light = fit.x, fit.ink_share, fit.light
     part = _stage(fit, stage.there[rows], clear)
     for name in Stage.__dataclass_fields__:
         if name not in ("kept", "whole", "saturated", "brighter"):
