@@ -113,7 +113,8 @@ def speed() -> None:
 
 
 if __name__ == "__main__":
-    header = ["kind", "psf px", "size px", "pitch px", "turned by", "measured", "error px", "claimed", "bound", "efficiency*", "within 95 %"]
-    print_table(header, (row(number, *case) for number, case in enumerate(CASES)), f"Error of one coordinate, contrast over noise {CONTRAST / NOISE:.0f}")
+    header = ["kind", "psf px", "size px", "pitch px", "turned by", "measured", "error px", "claimed", "bound", "efficiency*", "in 95 %"]
+    rows = (row(number, *case) for number, case in enumerate(CASES))
+    print_table(header, rows, f"Error of one coordinate, contrast over noise {CONTRAST / NOISE:.0f}")
     print("* of nodes with all 24 neighbours")
     speed()
