@@ -112,8 +112,9 @@ def _boxes(pattern: Pattern, pitch_mm: Array) -> Array:
     for i, name in enumerate(pattern.kind_names):
         for polygon in pattern.kinds[name].polygons:
             low, high = polygon.corners_mm.min(axis=0) / pitch_mm, polygon.corners_mm.max(axis=0) / pitch_mm
-            for a in range(int(np.floor(low[0] - CELL)), int(np.ceil(high[0] + CELL)) + 1):
-                for b in range(int(np.floor(low[1] - CELL)), int(np.ceil(high[1] + CELL)) + 1):
+            # the nodes whose own cells the ink is in
+            for a in range(int(np.ceil(low[0] - CELL)), int(np.floor(high[0] + CELL)) + 1):
+                for b in range(int(np.ceil(low[1] - CELL)), int(np.floor(high[1] + CELL)) + 1):
                     node = place.get((pattern.lattice[i, 0] + a, pattern.lattice[i, 1] + b))
                     if node is not None:
                         found[node].append(np.array([low[0] - a, high[0] - a, low[1] - b, high[1] - b]))
