@@ -41,8 +41,8 @@ Index = NDArray[np.int64]
 # Nodes whose pixels together stay in the processor's cache.
 COARSE_AT_ONCE, FULL_AT_ONCE = 160, 48
 NOISE_CHUNKS = 8
-# Nodes that lie closer have too few pixels to leave any out, or more than three of four.
-COARSE_STEPS_PX = (16.0, 26.0)
+# Nodes that lie closer have too few pixels to leave any out, or more than three of four; so have thin lines.
+COARSE_STEPS_PX, THIN_PX = (16.0, 26.0), (1.6, 2.2)
 # Edges are felt this far, in blurs and px; what is looked at before the blur is known.
 REACH_BLURS, REACH_EXTRA_PX = 2.5, 0.5
 FIRST_BLUR_PX, FIRST_REACH_PX = 1.2, 3.5
@@ -197,13 +197,20 @@ def first_guess(image: NDArray[Any], maps: LatticeMaps, shapes: NodeShapes) -> L
     return min(left, key=lambda guess: guess[1])[0]
 
 
+def _every(maps: LatticeMaps, x: Array) -> int:
+    """Each how many-th pixel the coarse fit needs of nodes at x (n, G)."""
+    step = np.linalg.norm(maps.step_px, axis=1)
+    step_px, width_px = float(np.median(step.min(axis=1))), float(np.median((2 * x[:, HALF] * step[:, ::-1]).min(axis=1)))
+    few, some = (step_px < step or width_px < thin for step, thin in zip(COARSE_STEPS_PX, THIN_PX, strict=True))
+    return 1 if few else 4 if some else 8
+
+
 def _coarse_chunk(
     image: NDArray[Any], maps: LatticeMaps, shapes: NodeShapes, first: Learnt, reach_px: float
 ) -> tuple[Stage, NodeFit, NodePixels]:
-    priors, step_px = priors_of(maps, shapes, first, held=True), float(np.median(np.linalg.norm(maps.step_px, axis=1).min(axis=1)))
+    priors = priors_of(maps, shapes, first, held=True)
     x, share = _start(priors), np.full(len(shapes.half), FIRST_INK_SHARE)
-    every = 1 if step_px < COARSE_STEPS_PX[0] else 4 if step_px < COARSE_STEPS_PX[1] else 8
-    pixels = node_pixels(image, maps, clear_of_ends(shapes, maps, reach_px), x[:, HALF], reach_px, every)
+    pixels = node_pixels(image, maps, clear_of_ends(shapes, maps, reach_px), x[:, HALF], reach_px, _every(maps, x))
     weights = Weights(1.0, 0.0, None, known=False)
     there = np.ones((len(x), 2, 2), bool)
     if shapes.crossing:
