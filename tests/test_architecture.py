@@ -23,7 +23,8 @@ ORDER = [
     # know nothing of cameras or dishes
     *("errors", "quality", "transforms", "robust"),
     # the camera
-    *("camera.model", "camera.undistort", "camera.board", "camera.chessboard", "camera.charuco", "camera.bundle", "camera.problem"),
+    *("camera.model", "camera.planar", "camera.undistort", "camera.board", "camera.chessboard", "camera.charuco"),
+    *("camera.bundle", "camera.problem"),
     *("camera.screening", "camera.calibrate", "camera.uncertainty", "camera.lens_choice", "camera.compare_cameras"),
     *("camera.resample", "camera.advice"),
     # shapes in which deformations are spoken of
@@ -40,6 +41,7 @@ ORDER = [
     # naming it
     *("targets.layout", "targets.rigid", "targets.markgrid", "targets.candidates", "targets.growth", "targets.constellations"),
     *("targets.beam", "targets.search", "targets.rivals", "targets.identify"),
+    *("targets.grid_ways", "targets.grid_search", "targets.grid_identify"),
     # measuring it in the raw pixels
     *("targets.solve", "targets.edges", "targets.light", "targets.pixels", "targets.window", "targets.neighbours"),
     *("targets.adjust", "targets.start", "targets.sensitivity", "targets.scene_noise", "targets.glare", "targets.stages"),

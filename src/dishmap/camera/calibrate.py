@@ -19,6 +19,7 @@ from dishmap.camera import bundle as ba
 from dishmap.camera.board import BENDS, BoardShape, BoardView
 from dishmap.camera.bundle import BoardCorners, Bundle
 from dishmap.camera.model import Camera
+from dishmap.camera.planar import planar_poses
 from dishmap.camera.problem import Problem, problem_of
 from dishmap.camera.screening import CHECK_INPUT, FEWEST_VIEWS, corner_weights, outlier_names, screened
 from dishmap.errors import FitError, InputError, MeasurementError
@@ -166,7 +167,7 @@ def _start(camera: Camera, corners: BoardCorners) -> Bundle:
         rays = trial.unproject(corners.pixels)
         if not np.isfinite(rays).all():
             continue
-        bundle = Bundle(trial, *_planar_poses(rays, corners), np.zeros(len(BENDS)))
+        bundle = Bundle(trial, *planar_poses(rays, corners.board_mm, corners.bounds[:-1]), np.zeros(len(BENDS)))
         length = np.linalg.norm(bundle.residuals(corners), axis=1)
         score = float(np.median(np.where(np.isfinite(length), length, np.inf)))
         if best is None or score < best[0]:
@@ -175,30 +176,6 @@ def _start(camera: Camera, corners: BoardCorners) -> Bundle:
         raise FitError("no focal length fits the views; do corners and board belong together, row by row?")
     # where single poses put corners behind the camera there is nothing to adjust from
     return best[1]
-
-
-def _planar_poses(rays: Array, corners: BoardCorners) -> tuple[Array, Array]:
-    """Rotations (V, 3, 3) and translations (V, 3) of planes from unit rays (M, 3) of their corners.
-
-    By the homography from board to rays (Zhang 2000, section 3.1 and appendix C).
-    """
-    starts, counts = corners.bounds[:-1], np.diff(corners.bounds)
-    middle = np.add.reduceat(corners.board_mm, starts) / counts[:, None]
-    plane = corners.board_mm - middle[corners.view]
-    size = np.sqrt(np.add.reduceat((plane**2).sum(axis=1), starts) / counts)
-    plane = np.concatenate([plane[:, :2] / size[corners.view, None], np.ones((len(rays), 1))], axis=1)
-    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    products = across[:, :, None, :, None] * (plane[:, :, None] * plane[:, None, :])[:, None, :, None, :]
-    system = np.add.reduceat(products.reshape(-1, 81), starts).reshape(-1, 9, 9)
-    homography = np.linalg.eigh(system)[1][:, :, 0].reshape(-1, 3, 3)
-    ahead = np.add.reduceat((rays * np.einsum("mij,mj->mi", homography[corners.view], plane)).sum(axis=1), starts)
-    homography *= np.where(ahead < 0, -1.0, 1.0)[:, None, None]
-    first, second, third = np.moveaxis(homography, 2, 0)
-    scale = np.sqrt(np.maximum(np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1), 1e-300))[:, None]
-    u, _, vt = np.linalg.svd(np.stack([first, second, np.cross(first, second) / scale], axis=-1) / scale[..., None])
-    u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
-    rotation = u @ vt
-    return rotation, size[:, None] * third / scale - np.einsum("vij,vj->vi", rotation, middle)
 
 
 def _result(

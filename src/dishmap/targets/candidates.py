@@ -15,7 +15,7 @@ from dishmap.camera.model import Camera
 from dishmap.targets.detect import Detections
 from dishmap.targets.ellipses import ellipse_matrices, invert_2x2
 from dishmap.targets.pattern import Marks
-from dishmap.targets.rigid import Sights
+from dishmap.targets.rigid import Sights, sights_of
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -79,24 +79,13 @@ def mark_candidates(detections: Detections, marks: Marks, camera: Camera) -> Can
     size = np.sqrt(detections.semi_axes_px.prod(axis=1))
     is_type, may_be, has_more = _types(detections, size, marks)
     index = np.flatnonzero(detections.dark & (is_type | may_be).any(axis=1) & ~_inside_another(detections, is_type))
-    ray = camera.unproject(detections.center_px[index])
-    tangent = tangent_axes(ray)
-    _, by_point, _ = camera.project_with_jacobians(ray)
+    sights = sights_of(camera, detections.center_px[index])
+    ray, tangent, px_per_tangent = sights.ray, sights.tangent, sights.px_per_tangent
     with np.errstate(invalid="ignore", divide="ignore"):
-        px_per_tangent = by_point @ tangent
         shape = invert_2x2(px_per_tangent) @ ellipse_matrices(detections.semi_axes_px[index], detections.angle_rad[index])
     center, types = detections.center_px[index], (is_type[index], may_be[index], has_more[index])
     found = Candidates(index, center, size[index], ray, tangent, shape, px_per_tangent, *types)
     return found.take(np.flatnonzero(np.isfinite(ray).all(axis=1) & np.isfinite(shape).all(axis=(1, 2))))
-
-
-def tangent_axes(ray: Array) -> Array:
-    """Axes (N, 3, 2) at right angles to unit rays (N, 3), the first towards image x, the second towards image y."""
-    x = np.array([1.0, 0.0, 0.0]) - ray * ray[:, :1]
-    norm = np.linalg.norm(x, axis=1, keepdims=True)
-    # a ray along x itself (a lens of 180 degrees) takes any axis
-    x = np.where(norm > 1e-6, x / np.maximum(norm, 1e-6), [0.0, 0.0, -1.0])
-    return np.stack([x, np.cross(ray, x)], axis=-1)
 
 
 def _inside_another(detections: Detections, is_type: Flags) -> Flags:

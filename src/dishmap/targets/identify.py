@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from dishmap.camera.model import Camera
-from dishmap.errors import IdentityError
+from dishmap.errors import IdentityError, InputError
 from dishmap.targets.candidates import Candidates, mark_candidates
 from dishmap.targets.detect import Detections
 from dishmap.targets.ellipses import root_det
@@ -91,7 +91,25 @@ class PoseGuess:
     camera_from_dish: Pose
 
 
-Hint = Upright | PoseGuess | None
+@dataclass(frozen=True)
+class Anchors:
+    """Hint, for grids: where some targets are in the photograph, within half of the distance to the next one.
+
+    ids (A,); place_px (A, 2); upright: also that the camera looks so, or None.
+    """
+
+    ids: tuple[int, ...]
+    place_px: Array
+    upright: Upright | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "ids", tuple(int(i) for i in self.ids))
+        object.__setattr__(self, "place_px", np.asarray(self.place_px, dtype=float).reshape(-1, 2))
+        if not self.ids or len(self.ids) != len(self.place_px) or not np.isfinite(self.place_px).all():
+            raise InputError(f"anchors need as many ids as places (u, v) in px, at least one, not {len(self.ids)} and {len(self.place_px)}")
+
+
+Hint = Upright | PoseGuess | Anchors | None
 
 
 @dataclass(frozen=True)
@@ -144,8 +162,10 @@ def identify(detections: Detections, pattern: Pattern, camera: Camera, hint: Hin
     """Find the pattern among detected ellipses.
 
     hint: None, Upright() or PoseGuess(camera_from_dish). Raises IdentityError when the pattern is not found, or could
-    sit in more than one way that the hint does not tell apart; the message lists these ways.
+    sit in more than one way that the hint does not tell apart; the message lists these ways. Raises InputError for Anchors.
     """
+    if isinstance(hint, Anchors):
+        raise InputError(f"anchors name targets of a grid, and {pattern.name!r} is made of circles; give --upright or a --pose-guess")
     candidates = mark_candidates(detections, pattern.marks, camera)
     _check_enough(detections, candidates, pattern)
     scene = scene_of(candidates, layout_of(pattern), camera)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dishmap.camera.model import Camera
 from dishmap.transforms import Pose, cross_matrix, rotation_from_vector
 
 Array = NDArray[np.float64]
@@ -37,6 +38,24 @@ class Sights:
     def take(self, index: NDArray[np.int64]) -> Sights:
         """The sights at `index`."""
         return Sights(self.ray[index], self.tangent[index], self.px_per_tangent[index])
+
+
+def sights_of(camera: Camera, place_px: Array) -> Sights:
+    """Places (n, 2) px of a photograph as rays; NaN where the lens model does not hold."""
+    ray = camera.unproject(place_px)
+    tangent = _tangent_axes(ray)
+    _, by_point = camera.project_with_point_jacobian(ray)
+    with np.errstate(invalid="ignore"):
+        return Sights(ray, tangent, by_point @ tangent)
+
+
+def _tangent_axes(ray: Array) -> Array:
+    """Axes (N, 3, 2) at right angles to unit rays (N, 3), the first towards image x, the second towards image y."""
+    x = np.array([1.0, 0.0, 0.0]) - ray * ray[:, :1]
+    norm = np.linalg.norm(x, axis=1, keepdims=True)
+    # a ray along x itself (a lens of 180 degrees) takes any axis
+    x = np.where(norm > 1e-6, x / np.maximum(norm, 1e-6), [0.0, 0.0, -1.0])
+    return np.stack([x, np.cross(ray, x)], axis=-1)
 
 
 @dataclass(frozen=True)
