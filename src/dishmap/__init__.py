@@ -41,7 +41,9 @@ if TYPE_CHECKING:
     from dishmap.targets.builders import dish, plate
     from dishmap.targets.detect import find_ellipses
     from dishmap.targets.grid_builders import grid
-    from dishmap.targets.identify import PoseGuess, Upright, identify
+    from dishmap.targets.grid_detect import find_grid
+    from dishmap.targets.grid_identify import identify_grid
+    from dishmap.targets.identify import Anchors, PoseGuess, Upright, identify
     from dishmap.targets.pattern import Pattern, Surface, TargetKind
     from dishmap.targets.pose import measure_targets
     from dishmap.targets.stages import Assumptions
@@ -52,6 +54,7 @@ if TYPE_CHECKING:
 
 # Where each public name lives; the imports above say the same to type checkers, and a test holds the two together.
 _HOME = {
+    "Anchors": "dishmap.targets.identify",
     "Assumptions": "dishmap.targets.stages",
     "Basis": "dishmap.surface.fit",
     "Camera": "dishmap.camera.model",
@@ -79,9 +82,11 @@ _HOME = {
     "facing_pose": "dishmap.simulate.scene",
     "find_boards": "dishmap.camera.chessboard",
     "find_ellipses": "dishmap.targets.detect",
+    "find_grid": "dishmap.targets.grid_detect",
     "fit_surface": "dishmap.surface.fit",
     "grid": "dishmap.targets.grid_builders",
     "identify": "dishmap.targets.identify",
+    "identify_grid": "dishmap.targets.grid_identify",
     "map_photograph": "dishmap.pipeline",
     "measure_targets": "dishmap.targets.pose",
     "track_targets": "dishmap.targets.track",
@@ -107,6 +112,7 @@ _HOME = {
 _OTHER_NAME = {"simulate_photograph": "simulate"}
 
 __all__ = [
+    "Anchors",
     "Assumptions",
     "Basis",
     "Camera",
@@ -135,9 +141,11 @@ __all__ = [
     "facing_pose",
     "find_boards",
     "find_ellipses",
+    "find_grid",
     "fit_surface",
     "grid",
     "identify",
+    "identify_grid",
     "map_photograph",
     "measure_targets",
     "paper_of",

@@ -19,7 +19,7 @@ from dishmap.errors import FitError, InputError, MeasurementError
 from dishmap.pipeline import cloud_of, map_photograph
 from dishmap.surface.cloud import PointCloud
 from dishmap.surface.fit import Basis, SurfaceFit, fit_surface, surface_heights
-from dishmap.targets.identify import Hint, PoseGuess
+from dishmap.targets.identify import Anchors, Hint, PoseGuess
 from dishmap.targets.paper import PaperPoses
 from dishmap.targets.pattern import Pattern
 from dishmap.targets.pose import TargetPoses
@@ -136,8 +136,11 @@ def combine_states(frames: Sequence[State]) -> State:
 
 
 def later_hint(hint: Hint, reference: State) -> Hint:
-    """How photographs after the reference are named: as the hint says, or else from the reference's pose, as the camera is fixed."""
-    return PoseGuess(reference.poses.camera_from_dish) if hint is None else hint
+    """How photographs after the reference are named: as the hint says, or else from the reference's pose, as the camera is fixed.
+
+    Anchors are places in the reference.
+    """
+    return PoseGuess(reference.poses.camera_from_dish) if hint is None or isinstance(hint, Anchors) else hint
 
 
 def compare_photographs(

@@ -233,7 +233,11 @@ def test_errors_of_the_system_become_sentences(shot: Path, tmp_path: Path, monke
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--upright", "--pose-guess", "x"], "either --pose-guess or --upright"),
+        (["--upright", "--pose-guess", "x"], "give --pose-guess alone, or --upright and --anchor without it"),
+        (["--anchor", "0@1,2", "--pose-guess", "x"], "give --pose-guess alone, or --upright and --anchor without it"),
+        (["--anchor", "5,6"], "'5,6' is not of the form 17@1203.5,866"),
+        (["--anchor", "1@5,nan"], "a finite number is needed, not nan"),
+        (["--anchor", "0@400,300"], "anchors name targets of a grid, and"),
         (["--method", "paper", "--normal-sigma-deg", "1"], "mean nothing to --method paper"),
         (["--normal-sigma-deg", "nan"], "a finite number above 0 up to 90 is needed, not nan"),
         (["--ink-spread-percent", "-1"], "a finite number above 0 up to 100 is needed, not -1"),

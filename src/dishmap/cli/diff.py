@@ -99,6 +99,7 @@ def diff_command(
     out: Path,
     pose_guess: Path | None,
     upright: bool,
+    anchors: tuple[tuple[int, float, float], ...],
     method: str,
     surface: str | None,
     reference_frame: tuple[Path, ...],
@@ -117,7 +118,7 @@ def diff_command(
     from dishmap.surface.fit import parse_basis
 
     priors = priors_of(method, **given)
-    hint = hint_of(pose_guess, upright)
+    hint = hint_of(pose_guess, upright, anchors)
     basis = None if surface is None else parse_basis(surface)
     check_method(method, basis)
     jobs = jobs_of(current, out, same_state)

@@ -46,6 +46,7 @@ def map_command(
     out: Path,
     pose_guess: Path | None,
     upright: bool,
+    anchors: tuple[tuple[int, float, float], ...],
     method: str,
     surface: str | None,
     spacecraft: Path | None,
@@ -62,7 +63,7 @@ def map_command(
     from dishmap.surface.fit import parse_basis
 
     assumptions = assumptions_of(method, **assumed)
-    hint = hint_of(pose_guess, upright)
+    hint = hint_of(pose_guess, upright, anchors)
     basis = None if surface is None else parse_basis(surface)
     camera, pattern = read_camera(camera_file), read_pattern(pattern_file)
     frame = None if spacecraft is None else read_pose(spacecraft, SPACECRAFT_KEY)

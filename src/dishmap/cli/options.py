@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -92,31 +93,57 @@ def out_folder(command: F) -> F:
     return click.option("--out", type=PATH, required=True, metavar="DIR", help=text)(command)
 
 
+class Anchor(click.ParamType):  # type: ignore[type-arg]  # generic in click's latest versions only
+    """A target's id and its place in the photograph, such as 17@1203.5,866."""
+
+    name = "id@u,v"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, float, float]:
+        """The id, u and v."""
+        if isinstance(value, tuple):
+            return value
+        ident, _, place = str(value).partition("@")
+        parts = place.split(",")
+        if not (ident.isascii() and ident.isdecimal() and len(ident) < 10 and len(parts) == 2):
+            self.fail(f"{value!r} is not of the form 17@1203.5,866 (a target's id, and where it is: u,v in px)", param, ctx)
+        u, v = (Number().convert(part, param, ctx) for part in parts)
+        return int(ident), u, v
+
+
 def hint_options(command: F) -> F:
-    """`--pose-guess FILE` and `--upright`: which way round the pattern is."""
+    """`--pose-guess FILE`, `--upright` and `--anchor ID@U,V`: which way round the pattern is."""
     guess = "Approximate pose of the pattern, within 20 degrees and 100 mm (JSON, camera_from_dish)."
     upright = "The camera looks along the pattern's -z with its y up in the photograph, within 45 degrees."
+    anchor = "A target of a grid and where it is in the photograph (px, within half a step); may be repeated, and go with --upright."
+    command = click.option("--anchor", "anchors", type=Anchor(), multiple=True, metavar="ID@U,V", help=anchor)(command)
     command = click.option("--upright", is_flag=True, help=upright)(command)
     return click.option("--pose-guess", type=PATH, metavar="FILE", help=guess)(command)
 
 
-def hint_of(pose_guess: Path | None, upright: bool) -> Hint:
-    """The hint that the two options give. Raises a usage error for both, InputError for a bad file."""
+def hint_of(pose_guess: Path | None, upright: bool, anchors: tuple[tuple[int, float, float], ...]) -> Hint:
+    """The hint that the options give. Raises a usage error for a guess beside others, InputError for a bad file."""
     from dishmap.io.pose_file import read_pose
-    from dishmap.targets.identify import PoseGuess, Upright
+    from dishmap.targets.identify import Anchors, PoseGuess, Upright
 
-    if pose_guess is not None and upright:
-        raise click.UsageError("give either --pose-guess or --upright, not both")
+    if pose_guess is not None and (upright or anchors):
+        raise click.UsageError("give --pose-guess alone, or --upright and --anchor without it")
     if pose_guess is not None:
         return PoseGuess(read_pose(pose_guess, CAMERA_KEY))
-    return Upright() if upright else None
+    straight = Upright() if upright else None
+    if anchors:
+        import numpy as np
+
+        return Anchors(tuple(ident for ident, _, _ in anchors), np.array([[u, v] for _, u, v in anchors]), straight)
+    return straight
 
 
 def hint_for(hint: Hint, photo: Path) -> Hint:
     """The hint for the pixels of a photograph: what is upright as viewers show it, after the turn of its EXIF, may lie in them."""
     from dishmap.io.images import read_turn_deg
-    from dishmap.targets.identify import Upright
+    from dishmap.targets.identify import Anchors, Upright
 
+    if isinstance(hint, Anchors) and hint.upright is not None:
+        return replace(hint, upright=Upright(read_turn_deg(photo)))
     return Upright(read_turn_deg(photo)) if isinstance(hint, Upright) else hint
 
 

@@ -30,7 +30,7 @@ from dishmap.io.pose_file import pose_content
 from dishmap.pipeline import Map
 from dishmap.surface.cloud import PointCloud, calibration_factor_mm, transform_cloud
 from dishmap.surface.fit import SurfaceFit
-from dishmap.targets.identify import Hint, PoseGuess
+from dishmap.targets.identify import Anchors, Hint, PoseGuess
 from dishmap.targets.pose import TargetPoses
 from dishmap.targets.stages import Assumptions
 from dishmap.transforms import Pose
@@ -242,6 +242,9 @@ def hint_content(hint: Hint) -> dict[str, Any]:
         return {"kind": "none"}
     if isinstance(hint, PoseGuess):
         return {"kind": "pose_guess", "camera_from_dish": pose_content(hint.camera_from_dish)}
+    if isinstance(hint, Anchors):
+        places = [{"id": ident, **_place(px)} for ident, px in zip(hint.ids, hint.place_px, strict=True)]
+        return {"kind": "anchors", "anchors": places, "upright": None if hint.upright is None else hint_content(hint.upright)}
     return {"kind": "upright", "turn_deg": hint.turn_deg} if hint.turn_deg else {"kind": "upright"}
 
 

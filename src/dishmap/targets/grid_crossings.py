@@ -63,7 +63,7 @@ def find_crossings(levels: list[Level]) -> tuple[Nodes, NDArray[np.int64]]:
     place, axes, response = (np.concatenate([f[k] for f in found]) for k in range(3))
     reduction = np.concatenate([np.full(len(f[0]), level.reduction) for f, level in zip(found, levels, strict=True)])
     keep = _best(place, response, reduction)
-    nodes = Nodes(place[keep], right_handed(axes[keep]), np.zeros(int(keep.sum()), dtype=bool))
+    nodes = Nodes(place[keep], right_handed(axes[keep]))
     return nodes, reduction[keep]
 
 

@@ -17,7 +17,8 @@ from dishmap.targets.grid_crossings import Level, find_crossings, levels_of
 from dishmap.targets.grid_map import LocalMap, local_map
 from dishmap.targets.grid_nodes import Nodes
 from dishmap.targets.grid_refine import filled_cells, refine_crossings
-from dishmap.targets.grid_squares import find_squares
+from dishmap.targets.grid_skips import unskipped
+from dishmap.targets.grid_squares import find_squares, open_squares
 from dishmap.targets.grid_walk import FEWEST_NODES, SURE, Walked, empty_places, table_of, walk, without_misfits
 
 Array = NDArray[np.float64]
@@ -73,7 +74,12 @@ def _squares(image: NDArray[Any]) -> GridDetections:
     components = walk(nodes, sized=True)
     if not components:
         raise IdentityError(_nothing(f"{len(nodes)} dark squares", "square"))
-    parts = [_Part(nodes.place_px[c.node], c.lattice, nodes.marked[c.node], np.zeros((0, 2), dtype=np.int64)) for c in components]
+    parts = []
+    for c in components:
+        squares = nodes.take(c.node)
+        table, low = table_of(squares.place_px, c.lattice, 0)
+        step_px = local_map(table, c.lattice - low, itself=True).step_px
+        parts.append(_Part(squares.place_px, c.lattice, open_squares(image, squares, step_px), np.zeros((0, 2), dtype=np.int64)))
     return _detections(parts, lines=False)
 
 
@@ -164,6 +170,9 @@ def _completed(levels: list[Level], nodes: Nodes, reduction: Ints, walked: Walke
         place, lattice, size = place[sound], lattice[sound], size[sound]
         if len(place) <= count:
             break
+    if len(place) >= FEWEST_NODES:
+        joined = unskipped(levels, size, place, lattice)
+        place, lattice = place[joined], lattice[joined]
     if len(place) < FEWEST_NODES:
         return _Part(place, lattice, np.zeros(len(place), dtype=bool), np.zeros((0, 2), dtype=np.int64))
     table, low = table_of(place, lattice, 0)

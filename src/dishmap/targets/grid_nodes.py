@@ -15,24 +15,23 @@ class Nodes:
     """Middles of squares, or crossings of lines, before it is known which lie on a lattice.
 
     place_px (M, 2); axes (M, 2, 2): two vectors (axis, uv) along the lattice's axes, px, right-handed (`right_handed`) but in any of four
-    quarter turns: half sides of a square, or unit directions of the lines of a crossing; marked (M,): shows an orientation mark.
+    quarter turns: half sides of a square, or unit directions of the lines of a crossing.
     """
 
     place_px: Array
     axes: Array
-    marked: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.place_px)
 
     def take(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> Nodes:
         """The nodes at `index`."""
-        return Nodes(self.place_px[index], self.axes[index], self.marked[index])
+        return Nodes(self.place_px[index], self.axes[index])
 
     @staticmethod
     def none() -> Nodes:
         """No nodes."""
-        return Nodes(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, dtype=bool))
+        return Nodes(np.zeros((0, 2)), np.zeros((0, 2, 2)))
 
 
 def right_handed(axes: Array) -> Array:

@@ -7,13 +7,12 @@ is only predicted is confirmed: there must be ink of both lines.
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.targets.grid_crossings import Level
 from dishmap.targets.grid_map import LocalMap
-from dishmap.targets.threshold import noise_level
+from dishmap.targets.threshold import noise_level, sampled
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -86,17 +85,6 @@ def _line_offsets(image: NDArray[np.uint8], line: Array, normal: Array, reach: A
     inside = ((line > 1) & (line < [w - 2, h - 2])).all(axis=-1)
     # beside a line it is equally light on both sides; beside the edge of something dark it is not
     return offset, (peak > least) & (at < WITHIN) & (np.abs(right - left) < EVEN * peak) & inside
-
-
-def sampled(image: NDArray[np.uint8], points: Array) -> Array:
-    """Grey levels of an image at points (..., 2), bilinear, repeated beyond the border."""
-    flat = points.reshape(-1, points.shape[-2], 2).astype(np.float32)
-    out = np.empty(flat.shape[:2])
-    # OpenCV maps hold less than 32768 rows
-    for start in range(0, len(flat), 30_000):
-        part = flat[start : start + 30_000]
-        out[start : start + 30_000] = cv2.remap(image, part[..., 0], part[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(out.reshape(points.shape[:-1]))
 
 
 def filled_cells(level: Level, table: Array) -> Ints:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from dishmap.targets.grid_nodes import Nodes, right_handed
-from dishmap.targets.threshold import edge_points, ink_contours, noise_level, reduced_image, white_level
+from dishmap.targets.threshold import edge_points, ink_contours, noise_level, reduced_image, sampled, white_level
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -32,12 +32,14 @@ LEAST_SQUARENESS = 0.1
 # Of a square with unit variances: half of a side, area, and the integral of |z|^4.
 HALF_SIDE, SQUARE_AREA, SQUARE_FOURTH = 3**0.5, 12.0, 33.6
 SMALLEST_HALF_SIDE_PX, LEAST_SIDE_RATIO = 1.2, 0.1
-# An open square has a light square about the same middle, to this part of its half side, and of this part of its sides.
-SAME_MIDDLE, OPEN_SIDES = 0.25, (0.2, 0.9)
+# A square's middle and outer part: where they are looked at, in half sides. One is open when its middle's darkness over that of the outer
+# part is below this part of what most of so many squares around show.
+MIDDLE_PART, FRAME_PART = 0.15, 0.76
+OPEN_RATIO, COMPARED = 0.8, 25
 
 
 def find_squares(gray: NDArray[Any]) -> Nodes:
-    """Dark squares of an image (H, W), uint8 or uint16; `marked` where a light square is nested in one. Axes are half sides."""
+    """Dark squares of an image (H, W), uint8 or uint16. Axes are half sides."""
     white = white_level(gray)
     base = 2 if gray.size > HALVE_ABOVE_PX else 1
     nodes = _search(gray, base, white)
@@ -62,8 +64,7 @@ def _search(gray: NDArray[Any], reduction: int, white: float) -> Nodes:
     keep = enough & square
     center = (center + origin)[keep] * reduction + (reduction - 1) / 2
     axes, dark = axes[keep] * reduction, dark[keep]
-    nodes = Nodes(center[dark], right_handed(axes[dark]), np.zeros(int(dark.sum()), dtype=bool))
-    return Nodes(nodes.place_px, nodes.axes, _is_open(nodes, center[~dark], axes[~dark]))
+    return Nodes(center[dark], right_handed(axes[dark]))
 
 
 def _parallelograms(points: Array, starts: NDArray[np.int64], counts: NDArray[np.int64]) -> tuple[Array, Array, Flags]:
@@ -108,11 +109,19 @@ def _root(covariance: Array) -> tuple[Array, Array]:
     return root, size
 
 
-def _is_open(nodes: Nodes, light_px: Array, light_axes: Array) -> Flags:
-    """Which nodes have a light square about their middle."""
-    if not len(nodes) or not len(light_px):
-        return np.zeros(len(nodes), dtype=bool)
-    distance, nearest = cKDTree(light_px).query(nodes.place_px)
-    size, inner = (np.sqrt(np.abs(np.linalg.det(a))) for a in (nodes.axes, light_axes[nearest]))
-    ratio = inner / size
-    return np.asarray((distance < SAME_MIDDLE * size) & (ratio > OPEN_SIDES[0]) & (ratio < OPEN_SIDES[1]))
+def open_squares(gray: NDArray[Any], nodes: Nodes, step_px: Array) -> Flags:
+    """Which squares (K,) have a light middle; step_px (K, 2, 2): steps of their lattice.
+
+    The darkness of the middle against that of the square's outer part, both below the ground half way to the next squares, is compared
+    with what most of the nearest squares show: so blur, which fills a small middle, does not hide it.
+    """
+    image = reduced_image(gray, 1, white_level(gray))
+    patch = np.stack(np.meshgrid(*[MIDDLE_PART * np.array([-1.0, 0.0, 1.0])] * 2), axis=-1).reshape(-1, 2)
+    along = np.array([(x, y) for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1))], dtype=float)
+    frame = (FRAME_PART * along[:, None] + patch).reshape(-1, 2)
+    corners = np.array([(x, y) for x in (-0.5, 0.5) for y in (-0.5, 0.5)])
+    middle, outer = (np.median(sampled(image, nodes.place_px[:, None] + at @ nodes.axes), axis=1) for at in (patch, frame))
+    ground = np.median(sampled(image, nodes.place_px[:, None] + corners @ np.swapaxes(step_px, 1, 2)), axis=1)
+    ratio = (ground - middle) / np.maximum(ground - outer, 1.0)
+    _, near = cKDTree(nodes.place_px).query(nodes.place_px, k=min(COMPARED, len(nodes)))
+    return np.asarray(ratio < OPEN_RATIO * np.median(ratio[near], axis=1))

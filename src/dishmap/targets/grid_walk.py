@@ -32,7 +32,7 @@ BRIDGE, SURE = 3, 0.12
 NEAREST, NEAREST_SIGMAS, CLEAR, LARGEST_TURN = 0.1, 2.5, 0.3, 0.5
 # A node farther off the local map of its neighbours than this, in steps (and sigmas), is dropped.
 LARGEST_MISFIT, MISFIT_SIGMAS = 0.12, 4.0
-ROUNDS = 60
+ROUNDS, RENUMBERINGS = 60, 12
 # Squares have the same size in steps to this ratio.
 SAME_SIZE = 1.35
 
@@ -52,9 +52,7 @@ def walk(nodes: Nodes, sized: bool) -> list[Walked]:
     links = Links(np.where(good, links.neighbour, -1), links.turn)
     free = np.ones(len(nodes), dtype=bool)
     components: list[Walked] = []
-    seeds = _numbered(links)
-    seeds.sort(key=lambda seed: -len(seed.node))
-    for seed in seeds:
+    for seed in sorted(_sound(nodes.place_px, links), key=lambda seed: -len(seed.node)):
         kept = free[seed.node]
         start = Walked(seed.node[kept], seed.lattice[kept])
         if len(start.node) < FEWEST_NODES:
@@ -68,19 +66,41 @@ def walk(nodes: Nodes, sized: bool) -> list[Walked]:
     return sorted(components, key=lambda c: -len(c.node))
 
 
-def _numbered(links: Links) -> list[Walked]:
-    """Columns and rows of all nodes that links join, breadth first; nodes on which two ways disagree are left out."""
+def _sound(place_px: Array, links: Links) -> list[Walked]:
+    """Numbered components in which all ways agree.
+
+    A link over a missing node puts all beyond it one off. Where it is, nodes are off the local map: without them, all are numbered
+    again. Only where two ways still disagree are the nodes themselves dropped on which they do.
+    """
+    for _ in range(RENUMBERINGS):
+        walks, doubtful = _numbered(links)
+        kept = [without_misfits(place_px, walked) for walked in walks if len(walked.node) >= FEWEST_NODES]
+        alive = np.zeros(len(place_px), dtype=bool)
+        alive[np.concatenate([k.node for k in kept] + [np.zeros(0, dtype=np.int64)])] = True
+        lost = sum(len(walked.node) for walked in walks if len(walked.node) >= FEWEST_NODES) - int(alive.sum())
+        if not lost and not doubtful:
+            return kept
+        if not lost:
+            alive[list(doubtful)] = False
+        bad = ~alive[:, None] | ~alive[links.neighbour]
+        links = Links(np.where(bad, -1, links.neighbour), links.turn)
+    return []
+
+
+def _numbered(links: Links) -> tuple[list[Walked], set[int]]:
+    """Columns and rows of all nodes that links join, breadth first; and the nodes on which two ways disagree."""
     neighbour, turn = links.neighbour.tolist(), links.turn.tolist()
     degree = (links.neighbour >= 0).sum(axis=1)
     place: dict[int, tuple[int, int]] = {}
     frame: dict[int, int] = {}
     walks: list[Walked] = []
+    doubtful: set[int] = set()
     ways = ((1, 0), (0, 1), (-1, 0), (0, -1))
     for first in np.argsort(-degree, kind="stable").tolist():
         if first in place or degree[first] == 0:
             continue
         place[first], frame[first] = (0, 0), 0
-        queue, members, doubtful = deque([first]), [first], set()
+        queue, members = deque([first]), [first]
         taken = {(0, 0): first}
         while queue:
             i = queue.popleft()
@@ -98,9 +118,8 @@ def _numbered(links: Links) -> list[Walked]:
                     place[j], frame[j], taken[at] = at, (frame[i] + turn[i][side]) % 4, j
                     queue.append(j)
                     members.append(j)
-        members = [m for m in members if m not in doubtful]
         walks.append(Walked(np.array(members, dtype=np.int64), np.array([place[m] for m in members], dtype=np.int64).reshape(-1, 2)))
-    return walks
+    return walks, doubtful
 
 
 def _grown(nodes: Nodes, start: Walked, free: Flags) -> Walked:

@@ -7,6 +7,7 @@ one, each counts as one contradiction.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,6 @@ from scipy.signal import fftconvolve
 from dishmap.targets.grid_detect import GridDetections
 from dishmap.targets.pattern import Pattern
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
@@ -48,7 +48,7 @@ class Ways:
         """The ways at `index`."""
         return Ways(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
-    def lattice(self, way: int, lattice: Array) -> Array:
+    def lattice(self, way: int, lattice: NDArray[Any]) -> NDArray[Any]:
         """Where a way puts places (..., 2) of the lattice in the grid's."""
         return np.asarray(turned(lattice, int(self.quarter[way])) + self.shift[way])
 
@@ -66,7 +66,7 @@ class MarkedLattice:
     marked: Ints
 
 
-def turned(lattice: NDArray[np.floating] | Ints, quarter: int) -> NDArray[np.floating] | Ints:
+def turned(lattice: NDArray[Any], quarter: int) -> NDArray[Any]:
     """Lattice places (..., 2) after quarter turns."""
     return np.asarray(lattice @ np.linalg.matrix_power(QUARTER, quarter % 4).T)
 
@@ -103,10 +103,10 @@ def all_ways(seen: MarkedLattice, printed: MarkedLattice, mirrored: bool = False
     flip = np.array([-1, 1]) if mirrored else np.array([1, 1])
     for quarter in range(4):
         node, judged, marked = (turned(flip * places, quarter) for places in (seen.node, seen.judged, seen.marked))
-        origin, hits = _overlap(np.asarray(node), printed.node)
+        origin, hits = _overlap(node, printed.node)
         # shifts of doubled places at every second of their own overlaps
         over = {
-            name: _sample(_overlap(np.asarray(a), b), origin, hits.shape)
+            name: _sample(_overlap(a, b), origin, hits.shape)
             for name, a, b in (
                 ("both", marked, printed.marked),
                 ("seen", marked, printed.judged),

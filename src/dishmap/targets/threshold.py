@@ -160,3 +160,14 @@ def darkest_nearby(flat: Image, at: NDArray[np.intp], width: int, here: NDArray[
     for k in (1, -1, width, -width, width + 1, width - 1, -width + 1, -width - 1):
         here = np.minimum(here, flat[np.clip(at + k, 0, flat.size - 1)])
     return here
+
+
+def sampled(image: NDArray[np.uint8], points: Array) -> Array:
+    """Grey levels of an image at points (..., 2), bilinear, repeated beyond the border."""
+    flat = points.reshape(-1, points.shape[-2], 2).astype(np.float32)
+    out = np.empty(flat.shape[:2])
+    # OpenCV maps hold less than 32768 rows
+    for start in range(0, len(flat), 30_000):
+        part = flat[start : start + 30_000]
+        out[start : start + 30_000] = cv2.remap(image, part[..., 0], part[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(out.reshape(points.shape[:-1]))
