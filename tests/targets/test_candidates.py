@@ -9,12 +9,13 @@ from scenes import WIDE
 
 from dishmap.camera.model import Camera
 from dishmap.targets.builders import concentric, disc, ring
-from dishmap.targets.candidates import mark_candidates, tangent_axes
+from dishmap.targets.candidates import mark_candidates
 from dishmap.targets.detect import Detections
 from dishmap.targets.ellipses import enclosing
 from dishmap.targets.layout import layout_of
 from dishmap.targets.markgrid import MarkGrid, meet_surface
 from dishmap.targets.pattern import Pattern, Surface, TargetKind
+from dishmap.targets.rigid import tangent_axes
 
 Array = NDArray[np.float64]
 

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 from scenes import FISHEYE, WIDE
 
 from dishmap.camera.model import Camera
-from dishmap.targets.candidates import tangent_axes
-from dishmap.targets.rigid import RigidFit, Sights, other_tilt, robust_pose, unbent_misfit
+from dishmap.targets.rigid import RigidFit, other_tilt, robust_pose, sights_of, unbent_misfit
 from dishmap.transforms import Pose, rotation_from_vector
 
 Array = NDArray[np.float64]
@@ -18,12 +17,6 @@ START = Pose(rotation_from_vector([0.08, -0.06, 0.1]) @ TRUTH.rotation, TRUTH.tr
 # The lens is linearised about what is seen, so the exact pose leaves nothing.
 EXACT_TURN_RAD, EXACT_SHIFT_MM = 1e-6, 1e-3
 NOISE_PX = 0.2
-
-
-def sights_of(camera: Camera, pixels: Array) -> Sights:
-    ray = camera.unproject(pixels)
-    tangent = tangent_axes(ray)
-    return Sights(ray, tangent, camera.project_with_jacobians(ray)[1] @ tangent)
 
 
 def points(rng: np.random.Generator, count: int = 40) -> Array:

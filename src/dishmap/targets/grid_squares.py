@@ -33,9 +33,10 @@ LEAST_SQUARENESS = 0.1
 HALF_SIDE, SQUARE_AREA, SQUARE_FOURTH = 3**0.5, 12.0, 33.6
 SMALLEST_HALF_SIDE_PX, LEAST_SIDE_RATIO = 1.2, 0.1
 # A square's middle and outer part: where they are looked at, in half sides. One is open when its middle's darkness over that of the outer
-# part is below this part of what most of so many squares around show.
+# part is below this part of what most of so many squares around show; where blur has filled the middle, below a larger part, if the
+# middle is also less dark than theirs by this factor. (A square that is merely faint has a usual ratio.)
 MIDDLE_PART, FRAME_PART = 0.15, 0.76
-OPEN_RATIO, COMPARED = 0.8, 25
+OPEN_RATIO, OPEN_RATIO_FAINT, OPEN_DEPTH, COMPARED = 0.8, 0.93, 0.75, 25
 
 
 def find_squares(gray: NDArray[Any]) -> Nodes:
@@ -122,6 +123,8 @@ def open_squares(gray: NDArray[Any], nodes: Nodes, step_px: Array) -> Flags:
     corners = np.array([(x, y) for x in (-0.5, 0.5) for y in (-0.5, 0.5)])
     middle, outer = (np.median(sampled(image, nodes.place_px[:, None] + at @ nodes.axes), axis=1) for at in (patch, frame))
     ground = np.median(sampled(image, nodes.place_px[:, None] + corners @ np.swapaxes(step_px, 1, 2)), axis=1)
-    ratio = (ground - middle) / np.maximum(ground - outer, 1.0)
+    depth = ground - middle
+    ratio = depth / np.maximum(ground - outer, 1.0)
     _, near = cKDTree(nodes.place_px).query(nodes.place_px, k=min(COMPARED, len(nodes)))
-    return np.asarray(ratio < OPEN_RATIO * np.median(ratio[near], axis=1))
+    ratio, depth = (value / np.maximum(np.median(value[near], axis=1), 1e-3) for value in (ratio, depth))
+    return np.asarray((ratio < OPEN_RATIO) | ((ratio < OPEN_RATIO_FAINT) & (depth < OPEN_DEPTH)))

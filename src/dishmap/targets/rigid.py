@@ -43,13 +43,13 @@ class Sights:
 def sights_of(camera: Camera, place_px: Array) -> Sights:
     """Places (n, 2) px of a photograph as rays; NaN where the lens model does not hold."""
     ray = camera.unproject(place_px)
-    tangent = _tangent_axes(ray)
+    tangent = tangent_axes(ray)
     _, by_point = camera.project_with_point_jacobian(ray)
     with np.errstate(invalid="ignore"):
         return Sights(ray, tangent, by_point @ tangent)
 
 
-def _tangent_axes(ray: Array) -> Array:
+def tangent_axes(ray: Array) -> Array:
     """Axes (N, 3, 2) at right angles to unit rays (N, 3), the first towards image x, the second towards image y."""
     x = np.array([1.0, 0.0, 0.0]) - ray * ray[:, :1]
     norm = np.linalg.norm(x, axis=1, keepdims=True)
