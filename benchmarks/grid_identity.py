@@ -101,15 +101,11 @@ def draw_scene(case: Case, rng: np.random.Generator) -> tuple[Scene, Pattern]:
         gradient=(rng.uniform(-0.6, 0.6), rng.uniform(-0.6, 0.6)),
         vignetting=rng.uniform(0, 0.3),
         background_grey=rng.uniform(5, 180),
-        glare=tuple(
-            Glare(_place(rng), rng.uniform(20, 90), rng.uniform(60, 400)) for _ in range(rng.integers(0, 4))
-        ),
+        glare=tuple(Glare(_place(rng), rng.uniform(20, 90), rng.uniform(60, 400)) for _ in range(rng.integers(0, 4))),
     )
     sensor = Sensor(psf_sigma_px=rng.uniform(0.6, min(2.5, step_px / 10)), noise_grey=rng.uniform(0.5, 4.0))
     gaps = random_line_gaps(rng, shown, 0.15) if case.lines else ()
-    front = tuple(
-        Disc(_place(rng), rng.uniform(15, 80), rng.uniform(10, 200)) for _ in range(rng.integers(0, 5))
-    )
+    front = tuple(Disc(_place(rng), rng.uniform(15, 80), rng.uniform(10, 200)) for _ in range(rng.integers(0, 5)))
     behind = random_shapes(rng, camera, 10, 10, 20, (4.0, 60.0), (10.0, 200.0))
     scene = Scene(shown, camera, roll @ side @ pose, light=light, sensor=sensor, line_gaps=gaps, background=behind, occluders=front)
     return scene, given

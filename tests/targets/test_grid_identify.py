@@ -38,9 +38,7 @@ def seen(pattern: Pattern, pose: Pose, keep: np.ndarray | None = None, quarter: 
     lattice = pattern.lattice @ turn.T + [40, -7]
     # steps by differences along the surface
     axes, ahead = pattern.axes, 1e-3
-    columns, rows = (
-        (eye.project(pose.apply(pattern.center_mm + ahead * axes[..., k])) - place) / ahead * PITCH for k in (0, 1)
-    )
+    columns, rows = ((eye.project(pose.apply(pattern.center_mm + ahead * axes[..., k])) - place) / ahead * PITCH for k in (0, 1))
     step = np.stack([columns, rows], axis=-1) @ np.linalg.inv(turn)
     cells = np.array([np.floor(turn @ (at + 0.5) + [40, -7]) for at in pattern.lattice[keep][is_marked(pattern)[keep]]], dtype=np.int64)
     cells = np.column_stack([np.zeros(len(cells), dtype=np.int64), cells.reshape(-1, 2)])

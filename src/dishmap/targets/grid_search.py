@@ -65,8 +65,7 @@ class GridSearch:
         columns, rows = self.table.shape
         if not len(ways) or ways.off.min() > FEW_OFF + LARGEST_OFF_PART * len(self.node):
             raise IdentityError(
-                f"the photograph shows {shown}, which do not fit on {name} of {columns} x {rows}; "
-                f"check that it is the printed pattern"
+                f"the photograph shows {shown}, which do not fit on {name} of {columns} x {rows}; check that it is the printed pattern"
             )
         best = ways.take(np.array([np.argmin(ways.cost)]))
         if best.contradict[0] > FEW_OFF + best.agree[0]:
