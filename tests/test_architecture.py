@@ -37,7 +37,7 @@ ORDER = [
     # finding it
     *("targets.threshold", "targets.ellipses", "targets.detect", "targets.subpixel"),
     *("targets.grid_nodes", "targets.grid_squares", "targets.grid_crossings", "targets.grid_map", "targets.grid_links"),
-    *("targets.grid_walk", "targets.grid_refine", "targets.grid_skips", "targets.grid_detect"),
+    *("targets.grid_walk", "targets.grid_refine", "targets.grid_skips", "targets.grid_mistaken", "targets.grid_detect"),
     # naming it
     *("targets.layout", "targets.rigid", "targets.markgrid", "targets.candidates", "targets.growth", "targets.constellations"),
     *("targets.beam", "targets.search", "targets.rivals", "targets.identify"),

@@ -7,7 +7,7 @@ import pytest
 
 from dishmap.errors import IdentityError, ImageError
 from dishmap.targets.grid_detect import find_grid
-from tests.grids import GridScene, camera, line_photograph, look, matched, square_photograph
+from tests.grids import GridScene, box, camera, line_photograph, look, matched, photograph, square_photograph
 
 # What the record promises of places is some tenths of a pixel; a node one step off would be 20 px off.
 PLACE_RMS_PX, PLACE_WORST_PX = 0.15, 0.8
@@ -113,6 +113,33 @@ def test_one_row_or_no_grid_is_refused() -> None:
     for lines in (False, True):
         with pytest.raises(IdentityError, match="no lattice of three by three"):
             find_grid(noise, lines)
+
+
+@pytest.mark.parametrize("lines", [True, False])
+def test_a_chessboard_is_none_of_both(lines: bool) -> None:
+    scene = GridScene(camera(), look(15.0, roll_deg=20.0), **SMALL)
+    fields = [box((c - 0.5, r - 0.5), (c + 0.5, r + 0.5)) for c, r in scene.lattice().tolist() if (c + r) % 2 == 0]
+    image = photograph(scene.coverage(fields, 1.0), np.random.default_rng(8), 1.0)
+    with pytest.raises(IdentityError, match="the photograph shows a chessboard, and the pattern is"):
+        find_grid(image, lines)
+
+
+def test_the_other_kind_of_grid_is_named() -> None:
+    scene = GridScene(camera(), look(15.0), **SMALL)
+    with pytest.raises(IdentityError, match="shows a grid of lines, and the pattern is one of squares"):
+        find_grid(line_photograph(scene, np.random.default_rng(9)), lines=False)
+    with pytest.raises(IdentityError, match="shows separate squares, and the pattern is a grid of lines"):
+        find_grid(square_photograph(scene, np.random.default_rng(9)), lines=True)
+
+
+TOO_FINE = [(1750.0, r"lines are 4\.\d px apart, and 5 are needed"), (3100.0, r"with a period of 2\.7 px, too fine")]
+
+
+@pytest.mark.parametrize(("distance", "message"), TOO_FINE)
+def test_a_grid_too_fine_is_refused(distance: float, message: str) -> None:
+    scene = GridScene(camera(320, 240), look(5.0, 40.0, 20.0, distance), columns=60, rows=60)
+    with pytest.raises(IdentityError, match=message):
+        find_grid(line_photograph(scene, np.random.default_rng(10), blur_px=0.6), lines=True)
 
 
 def test_other_arrays_are_refused() -> None:

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from dishmap.errors import IdentityError, ImageError
 from dishmap.targets.grid_crossings import Level, find_crossings, levels_of
 from dishmap.targets.grid_map import LocalMap, local_map
+from dishmap.targets.grid_mistaken import LINES, SQUARES, fine_period_px, kind_of
 from dishmap.targets.grid_nodes import Nodes
 from dishmap.targets.grid_refine import filled_cells, refine_crossings
 from dishmap.targets.grid_skips import unskipped
@@ -28,6 +29,8 @@ Flags = NDArray[np.bool_]
 # Lines are searched at a reduction that leaves no more than this many pixels, and at half of it where steps between crossings are
 # below so many pixels there.
 FINEST_PX, FINE_STEP_PX = 1_500_000, 7.5
+LEAST_STEP_PX = 5.0
+COARSER = "go nearer, take a longer lens, or print a coarser grid"
 # Crossings that were not seen as such are looked for at predicted places, so many rows of them, up to this distance from known ones
 # and with at least this many arms of ink; refined ones lie within this part of a step of the prediction.
 LOOKS, LOOK_REACH, LOOK_ARMS, LOOK_OFF = 8, 2, 3, 0.15
@@ -73,7 +76,11 @@ def _squares(image: NDArray[Any]) -> GridDetections:
     nodes = find_squares(image)
     components = walk(nodes, sized=True)
     if not components:
-        raise IdentityError(_nothing(f"{len(nodes)} dark squares", "square"))
+        other, levels, _ = _crossings(image)
+        kind = kind_of(levels[0], table_of(other[0].place_px, other[0].lattice, 0)[0]) if other else SQUARES
+        if kind != SQUARES:
+            raise IdentityError(f"the photograph shows {kind}, and the pattern is one of squares; give the pattern that was photographed")
+        raise _nothing(image, f"{len(nodes)} dark squares", "square")
     parts = []
     for c in components:
         squares = nodes.take(c.node)
@@ -83,8 +90,12 @@ def _squares(image: NDArray[Any]) -> GridDetections:
     return _detections(parts, lines=False)
 
 
-def _nothing(found: str, what: str) -> str:
-    return (
+def _nothing(image: NDArray[Any], found: str, what: str) -> IdentityError:
+    """What was found that is no grid, and what to do."""
+    period = fine_period_px(image)
+    if period:
+        return IdentityError(f"the photograph shows something with a period of {period:.1f} px, too fine to be measured; {COARSER}")
+    return IdentityError(
         f"{found} were found, but no lattice of three by three or more; check that this is the photograph of the grid, that it is "
         f"sharp, and that more than two rows of it are in view, each {what} several pixels from the next"
     )
@@ -118,7 +129,22 @@ def _detections(parts: list[_Part], lines: bool) -> GridDetections:
 
 
 def _lines(image: NDArray[Any]) -> GridDetections:
-    """Crossings, searched at the reduction that is fine enough for them."""
+    """Crossings of lines that are lines."""
+    parts, levels, candidates = _crossings(image)
+    if not parts:
+        raise _nothing(image, f"{candidates} places that look like crossings of dark lines", "crossing")
+    kind = kind_of(levels[0], table_of(parts[0].place_px, parts[0].lattice, 0)[0])
+    if kind != LINES:
+        raise IdentityError(f"the photograph shows {kind}, and the pattern is a grid of lines; give the pattern that was photographed")
+    found = _detections(parts, lines=True)
+    step = float(np.median(np.linalg.norm(found.step_px[found.component == 0], axis=1).min(axis=1)))
+    if step < LEAST_STEP_PX:
+        raise IdentityError(f"the grid's lines are {step:.1f} px apart, and {LEAST_STEP_PX:.0f} are needed; {COARSER}")
+    return found
+
+
+def _crossings(image: NDArray[Any]) -> tuple[list[_Part], list[Level], int]:
+    """Components of crossings, searched at the reduction that is fine enough for them; its levels; and how many candidates there were."""
     finest = 1
     while image.size > FINEST_PX * finest**2:
         finest *= 2
@@ -129,13 +155,9 @@ def _lines(image: NDArray[Any]) -> GridDetections:
         if finest == 1 or (components and _smallest_step(nodes, components[0]) > FINE_STEP_PX * finest):
             break
         finest //= 2
-    if not components:
-        raise IdentityError(_nothing(f"{len(nodes)} places that look like crossings of dark lines", "crossing"))
     parts = [_completed(levels, nodes, reduction, c) for c in components]
-    parts = [p for p in parts if len(p.place_px) >= FEWEST_NODES]
-    if not parts:
-        raise IdentityError(_nothing("Crossings of dark lines", "crossing"))
-    return _detections(sorted(parts, key=lambda p: -len(p.place_px)), lines=True)
+    parts = sorted((p for p in parts if len(p.place_px) >= FEWEST_NODES), key=lambda p: -len(p.place_px))
+    return parts, levels, len(nodes)
 
 
 def _smallest_step(nodes: Nodes, walked: Walked) -> float:

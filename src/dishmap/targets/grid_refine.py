@@ -87,24 +87,29 @@ def _line_offsets(image: NDArray[np.uint8], line: Array, normal: Array, reach: A
     return offset, (peak > least) & (at < WITHIN) & (np.abs(right - left) < EVEN * peak) & inside
 
 
-def filled_cells(level: Level, table: Array) -> Ints:
-    """Lower corners (K, 2) of the cells of a table of crossings (C, R, 2) whose middle is as dark as the lines."""
+def whole_cells(level: Level, table: Array) -> tuple[Array, Ints]:
+    """Corners (K, 4, 2), in px of the level, of the cells of a table of places (C, R, 2) that are whole, and their lower corners (K, 2)."""
     corners = np.stack([table[:-1, :-1], table[1:, :-1], table[:-1, 1:], table[1:, 1:]], axis=2)
     cells = np.argwhere(np.isfinite(corners).all(axis=(2, 3)))
+    return (corners[cells[:, 0], cells[:, 1]] - (level.reduction - 1) / 2) / level.reduction, cells
+
+
+def filled_cells(level: Level, table: Array) -> Ints:
+    """Lower corners (K, 2) of the cells of a table of crossings (C, R, 2) whose middle is as dark as the lines."""
+    around, cells = whole_cells(level, table)
     if not len(cells):
         return cells
-    around = (corners[cells[:, 0], cells[:, 1]] - (level.reduction - 1) / 2) / level.reduction
     far = [GROUND_AT, 1 - GROUND_AT]
     near = [0.5 - MIDDLE_AT, 0.5, 0.5 + MIDDLE_AT]
     ground, middle = (np.array([(x, y) for x in at for y in at]) for at in (far, near))
-    light, center = (sampled(level.image, _bilinear(around, xy)) for xy in (ground, middle))
+    light, center = (sampled(level.image, bilinear(around, xy)) for xy in (ground, middle))
     dark = sampled(level.image, around)
     contrast = np.median(light, axis=1) - np.median(dark, axis=1)
     filled = np.median(light, axis=1) - center.mean(axis=1) > FILLED * contrast
     return np.asarray(cells[filled & (contrast > LEAST_DEPTH)])
 
 
-def _bilinear(corners: Array, xy: Array) -> Array:
+def bilinear(corners: Array, xy: Array) -> Array:
     """Points (K, Q, 2) at fractions xy (Q, 2) of cells with corners (K, 4, 2)."""
     x, y = xy.T
     weight = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=1)
