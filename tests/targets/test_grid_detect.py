@@ -132,12 +132,12 @@ def test_the_other_kind_of_grid_is_named() -> None:
         find_grid(square_photograph(scene, np.random.default_rng(9)), lines=True)
 
 
-TOO_FINE = [(1750.0, r"lines are 4\.\d px apart, and 5 are needed"), (3100.0, r"with a period of 2\.7 px, too fine")]
+TOO_FINE = [(1800.0, r"lines are 4\.\d px apart, and 5 are needed"), (3100.0, r"with a period of 2\.7 px, too fine")]
 
 
 @pytest.mark.parametrize(("distance", "message"), TOO_FINE)
 def test_a_grid_too_fine_is_refused(distance: float, message: str) -> None:
-    scene = GridScene(camera(320, 240), look(5.0, 40.0, 20.0, distance), columns=60, rows=60)
+    scene = GridScene(camera(480, 360), look(5.0, 40.0, 20.0, distance), columns=60, rows=60)
     with pytest.raises(IdentityError, match=message):
         find_grid(line_photograph(scene, np.random.default_rng(10), blur_px=0.6), lines=True)
 
