@@ -24,7 +24,7 @@ ORDER = [
     *("errors", "quality", "transforms", "robust"),
     # the camera
     *("camera.model", "camera.planar", "camera.undistort", "camera.board", "camera.chessboard", "camera.charuco"),
-    *("camera.bundle", "camera.problem"),
+    *("camera.bundle", "camera.elimination", "camera.adjustment", "camera.problem", "camera.learning"),
     *("camera.screening", "camera.calibrate", "camera.uncertainty", "camera.lens_choice", "camera.compare_cameras"),
     *("camera.resample", "camera.advice"),
     # shapes in which deformations are spoken of

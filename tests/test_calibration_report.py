@@ -96,13 +96,13 @@ def test_photographs_without_a_board_are_named_on_the_page() -> None:
 
 def test_a_bent_board_and_lost_corners_are_said() -> None:
     calibration, checks = made()
-    bent = replace(calibration.board, bend_mm=np.array([1.0, 0.0, 0.0]), covariance_mm2=np.eye(3) * 1e-4)
+    bent = replace(calibration.board, shape_mm=np.array([1.0, 0.0, 0.0, 0.0, 0.0]), covariance_mm2=np.eye(5) * 1e-4)
     used = (np.arange(88) > 5, *calibration.used[1:])
     said = " ".join(remarks_on(replace(calibration, board=bent, used=used), checks))
     assert "The board is not flat, by 1.00 mm" in said
     assert re.search(r"0: 6 corners left out: \(0, 0\) mm, [\d.]+ px off; .* and 2 more\.", said)
     flat = calibrate(calibration.views, 960, 720, flat=True)
-    assert "The board was taken as flat." in calibration_report(flat, "flat", Checks())
+    assert "The board was taken as flat and printed exactly." in calibration_report(flat, "flat", Checks())
 
 
 @pytest.mark.parametrize("model", ["opencv", "fisheye"])

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.camera.advice import Suggestion
-from dishmap.camera.board import BENDS
+from dishmap.camera.board import SHAPE_TERMS
 from dishmap.camera.calibrate import Calibration
 from dishmap.camera.compare_cameras import Halves
 from dishmap.camera.lens_choice import LensChoice
@@ -171,6 +171,7 @@ def _facts(calibration: Calibration, checks: Checks) -> list[tuple[str, str, str
         ("Views used", f"{len(views)} of {len(views) + left_out}", f"{int(used.sum())} of {len(used)} corners"),
         ("Rms residual", f"{number(calibration.rms_px)} px", f"length; {number(calibration.rms_px / np.sqrt(2))} px per coordinate"),
         ("Noise of a coordinate", f"{number(calibration.sigma_px)} px", f"sigmas enlarged {number(calibration.inflation)} times"),
+        *_nuisances(calibration),
         ("Coverage", f"{calibration.coverage:.0%}", "of the picture held corners"),
         ("Board, mm", f"{_mm(long)}x{_mm(short)}", f"seen {_mm(near)} to {_mm(far)} mm away"),
     ]
@@ -179,6 +180,17 @@ def _facts(calibration: Calibration, checks: Checks) -> list[tuple[str, str, str
         facts.append(("Two halves differ by", f"{number(checks.halves.difference.covered_rms_px)} px", detail))
     if checks.resampled is not None:
         facts.append(("Sampled over claimed", number(checks.resampled.ratio), f"error of shapes, {checks.resampled.samples} refits"))
+    return facts
+
+
+def _nuisances(calibration: Calibration) -> list[tuple[str, str, str]]:
+    """What was found beside noise, in words: errors of the print, and motion while a picture was read."""
+    facts = []
+    if calibration.board.print_sigma_mm:
+        facts.append(("Print", f"{number(calibration.board.print_sigma_mm)} mm", "typical error of a printed coordinate, allowed for"))
+    if calibration.motion_sigma_mm:
+        detail = f"typical motion while a picture is read by {calibration.readout}, allowed for"
+        facts.append(("Motion", f"{number(calibration.motion_sigma_mm)} mm", detail))
     return facts
 
 
@@ -261,21 +273,30 @@ def _lens(calibration: Calibration, choice: LensChoice | None) -> str:
         for trial in choice.trials
     ]
     heads = ("lens model, from lean to rich", "rms of its own views (px)", "typical rms of views held out (px)", "")
-    return section("Lens", paragraph(f"{choice.reason}."), table(heads, rows, (0, 3)), picture)
+    readout = paragraph(f"{choice.readout_reason[:1].upper()}{choice.readout_reason[1:]}.") if choice.readout_reason else ""
+    return section("Lens", paragraph(f"{choice.reason}."), table(heads, rows, (0, 3)), readout, picture)
 
 
 def _board(calibration: Calibration) -> str:
     board = calibration.board
     if not board.free:
-        return section("Board", paragraph("The board was taken as flat."))
+        return section("Board", paragraph("The board was taken as flat and printed exactly."))
+    sigmas = np.sqrt(np.diag(board.covariance_mm2))
     rows = [
-        (name, f"{bend:.4f}", number(float(sigma)), "mm") for name, bend, sigma in zip(BENDS, board.bend_mm, board.sigma_mm, strict=True)
+        (name, f"{size:.4f}", number(float(sigma)), "mm") for name, size, sigma in zip(SHAPE_TERMS, board.shape_mm, sigmas, strict=True)
     ]
     about = (
         f"Height over a plane at {number(board.half_mm)} mm from the board's middle, along its x and y, positive away from the camera for "
-        f"corners and towards it for circles. In all {number(board.sag_mm)} mm from the lowest to the highest point."
+        f"corners and towards it for circles. In all {number(board.sag_mm)} mm from the lowest to the highest point. Stretch and skew "
+        "are in the plane: along x longer and along y shorter, and out of square."
     )
-    return section("Board", paragraph(about), table(("bend", "value", "sigma", "unit"), rows, (0, 3)))
+    prints = (
+        f"Printed points lie {number(board.print_sigma_mm)} mm (sigma of a coordinate) off their places, alike in all views; this was "
+        "learnt point by point and allowed for."
+        if board.print_sigma_mm
+        else "No error of the print itself is seen."
+    )
+    return section("Board", paragraph(about), paragraph(prints), table(("term", "value", "sigma", "unit"), rows, (0, 3)))
 
 
 def _parameters(camera: Camera) -> str:

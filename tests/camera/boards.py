@@ -1,17 +1,18 @@
-"""Simulated photographs of boards of circles, and corners of chessboards, for the tests of calibration."""
+"""Simulated photographs of boards of circles and of chessboards, and corners of chessboards, for the tests of calibration."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dishmap.camera.board import BENDS, BoardView, bends_of
+from dishmap.camera.board import BENDS, SHAPE_TERMS, STRETCHES, BoardView, shapes_of
 from dishmap.camera.chessboard import chessboard_mm
 from dishmap.camera.model import Camera
 from dishmap.simulate.render import simulate
 from dishmap.simulate.scene import Scene, Sensor
 from dishmap.targets.pattern import Pattern
-from dishmap.transforms import Pose
+from dishmap.transforms import Pose, rotation_from_vector
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8] | NDArray[np.uint16]
@@ -52,13 +53,96 @@ def photographs(rng: np.random.Generator, camera: Camera, pattern: Pattern, coun
     ], poses
 
 
-def corner_views(rng: np.random.Generator, camera: Camera, count: int, noise_px: float = 0.1, bend_mm: float = 0.0) -> list[BoardView]:
-    """Views of a chessboard with noise on its corners; bend_mm: sigma of each of its bends, which all views share."""
-    middle = CORNERS.mean(axis=0)
+def corner_views(
+    rng: np.random.Generator,
+    camera: Camera,
+    count: int,
+    noise_px: float = 0.1,
+    bend_mm: float = 0.0,
+    stretch_mm: float = 0.0,
+    print_mm: float = 0.0,
+    motion_mm: float = 0.0,
+) -> list[BoardView]:
+    """Views of a chessboard with noise on its corners.
+
+    Sigmas of what is wrong with the board, the same in all views: bend_mm of each of its bends, stretch_mm of stretch and skew, print_mm
+    of each printed point. motion_mm: sigma of the board's shift and turn (at half its side) while the rows of a picture are read.
+    """
+    middle, half = CORNERS.mean(axis=0), float(np.ptp(CORNERS, axis=0).max()) / 2
     printed = CORNERS - middle
-    printed[:, 2] += bends_of(printed, np.zeros(2), float(np.ptp(printed, axis=0).max()) / 2) @ rng.normal(size=len(BENDS)) * bend_mm
+    terms = rng.normal(size=len(SHAPE_TERMS)) * ([bend_mm] * len(BENDS) + [stretch_mm] * len(STRETCHES))
+    printed += shapes_of(printed, np.zeros(2), half) @ terms
+    if print_mm:
+        printed[:, :2] += rng.normal(size=(len(CORNERS), 2)) * print_mm
     poses = poses_in_view(rng, camera, printed, count)
-    return [
-        BoardView(f"{k}", camera.project(pose.apply(printed)) + rng.normal(size=(len(CORNERS), 2)) * noise_px, CORNERS)
-        for k, pose in enumerate(poses)
-    ]
+    pixels = [moving_corners(camera, pose, printed, rng.normal(size=6) * motion_mm / ([half] * 3 + [1.0] * 3)) for pose in poses]
+    return [BoardView(f"{k}", seen + rng.normal(size=seen.shape) * noise_px, CORNERS) for k, seen in enumerate(pixels)]
+
+
+def moving_corners(camera: Camera, pose: Pose, points_mm: Array, motion: Array) -> Array:
+    """Pixels of points (N, 3) on a board that turns by motion[:3] about its middle and shifts by motion[3:] while the rows are read."""
+    arms = points_mm @ pose.rotation.T
+    pixels = camera.project(arms + pose.translation_mm)
+    if motion.any():
+        for _ in range(8):  # when a point is read depends on where it is seen: each round is some hundred times nearer
+            when = ((pixels[:, 1] + 0.5) / camera.height_px - 0.5)[:, None]
+            turned = np.einsum("nij,nj->ni", rotation_from_vector(when * motion[:3]), arms)
+            pixels = camera.project(turned + pose.translation_mm + when * motion[3:])
+    return pixels
+
+
+def chessboard_photographs(
+    rng: np.random.Generator, camera: Camera, corners: tuple[int, int], square_mm: float, count: int, noise_grey: float = 1.5
+) -> tuple[list[tuple[str, Gray]], list[Pose]]:
+    """Photographs (name, gray) of a flat chessboard with these inner corners, and the poses in them."""
+    columns, rows = corners
+    outline = square_mm * np.array(
+        [[x, y, 0.0] for x in (-(columns + 1) / 2, (columns + 1) / 2) for y in (-(rows + 1) / 2, (rows + 1) / 2)]
+    )
+    poses: list[Pose] = []
+    while len(poses) < count:  # the renderer needs rays all over the box that holds the board; some lenses end in the picture's corners
+        pose = poses_in_view(rng, camera, outline, 1)[0]
+        seen = camera.project(pose.apply(outline))
+        box = np.stack(np.meshgrid(*np.stack([seen.min(axis=0) - 20, seen.max(axis=0) + 20], axis=-1)), axis=-1)
+        if np.isfinite(camera.unproject(box)).all():
+            poses.append(pose)
+    return [(f"{k}.png", chessboard_photograph(rng, camera, pose, corners, square_mm, noise_grey)) for k, pose in enumerate(poses)], poses
+
+
+def chessboard_photograph(
+    rng: np.random.Generator, camera: Camera, pose: Pose, corners: tuple[int, int], square_mm: float, noise_grey: float
+) -> NDArray[np.uint8]:
+    """One photograph, the board's middle at the pose: 4x4 samples a pixel, blurred by 0.7 px, with noise.
+
+    Where on the board a sample lies is interpolated by splines between exact rays 8 px apart. A sample near an edge is grey by how
+    much of it the edge leaves, so that edges are where they should be to some thousandths of a pixel.
+    """
+    from scipy.interpolate import RectBivariateSpline
+
+    step, fine = 8.0, 4
+    columns, rows = corners
+    grid = np.stack(np.meshgrid(np.linspace(-1, columns, 50), np.linspace(-1, rows, 50), [0.0]), axis=-1).reshape(-1, 3)
+    seen = camera.project(pose.apply((grid - [(columns - 1) / 2, (rows - 1) / 2, 0.0]) * square_mm))
+    low = np.maximum(np.floor(seen.min(axis=0)).astype(int) - 6, 0)
+    high = np.minimum(np.ceil(seen.max(axis=0)).astype(int) + 7, [camera.width_px, camera.height_px])
+    u, v = (np.linspace(a - 0.5, b - 0.5, int((b - a) / step) + 4) for a, b in zip(low, high, strict=True))
+    rays = camera.unproject(np.stack(np.meshgrid(u, v), axis=-1))
+    assert np.isfinite(rays).all()
+    inverse = pose.rotation.T
+    origin, along = inverse @ -pose.translation_mm, rays @ inverse.T
+    board = origin[:2] - along[..., :2] * (origin[2] / along[..., 2])[..., None]
+    column, row = ((np.arange(fine * a, fine * b) + 0.5) / fine - 0.5 for a, b in zip(low, high, strict=True))
+    shade = np.ones((len(row), len(column)), dtype=np.float32)
+    inside = shade > 0
+    for axis, inner in enumerate(corners):
+        x = RectBivariateSpline(v, u, board[..., axis] / square_mm + (inner - 1) / 2)(row, column).astype(np.float32)
+        width = np.hypot(np.gradient(x, axis=0), np.gradient(x, axis=1))  # of a sample, in squares
+        nearest = np.clip(np.rint(x), 0, inner - 1)
+        edge = np.clip(2 * (x - nearest) / width, -1, 1)
+        shade *= np.where(nearest % 2 == 0, edge, -edge)
+        inside &= (x > -1) & (x < inner)
+    light = cv2.GaussianBlur(np.where(inside, 110 + 85 * shade, 195).astype(np.float32), (0, 0), 0.7 * fine)
+    gray = np.full((camera.height_px, camera.width_px), 195.0)
+    box = tuple(int(n) for n in high - low)
+    gray[low[1] : high[1], low[0] : high[0]] = cv2.resize(light, box, interpolation=cv2.INTER_AREA)
+    return np.clip(np.rint(gray + rng.normal(size=gray.shape) * noise_grey), 0, 255).astype(np.uint8)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from dishmap.camera.board import BENDS, BoardShape, BoardView
+from dishmap.camera.board import SHAPE_TERMS, BoardShape, BoardView
 from dishmap.camera.calibrate import Calibration
 from dishmap.camera.model import Camera
 from dishmap.errors import CameraError, InputError
@@ -359,9 +359,12 @@ def calibration(count: int) -> Calibration:
         notes=(),
         lens="opencv5",
         view_weight=np.ones(count),
-        board=BoardShape(np.zeros(2), 50.0, np.zeros(len(BENDS)), np.eye(len(BENDS))),
+        board=BoardShape(np.zeros(2), 50.0, np.zeros(len(SHAPE_TERMS)), np.eye(len(SHAPE_TERMS)), np.zeros((1, 3)), np.ones((1, 2)), 0.1),
         expected=LENS5.parameters,
         independent=1.0,
+        readout="rows",
+        motion=np.ones((count, 6)),
+        motion_sigma_mm=0.2,
     )
 
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dishmap.camera import bundle as ba
-from dishmap.camera.board import bends_of
-from dishmap.camera.bundle import BoardCorners
+from dishmap.camera import elimination as el
+from dishmap.camera.board import shapes_of
+from dishmap.camera.bundle import BoardCorners, Prior
 from dishmap.camera.calibrate import Calibration
 from dishmap.camera.compare_cameras import working_distance_mm
 from dishmap.camera.model import Camera
@@ -70,8 +70,9 @@ def suggestions(calibration: Calibration, count: int = SUGGESTIONS, distance_mm:
         return ()
     corners = problem.corners(bundle)
     free, prior = problem.free(bundle), problem.prior(bundle, corners, calibration.weights)
-    equations = ba.normal_equations(bundle, corners, free, calibration.weights, prior)
-    information = ba.reduced(equations)[0].sum(axis=0) + np.diag(equations.prior)
+    known = el.marginals(el.normal_equations(bundle, corners, free, calibration.weights, prior)).covariance
+    scale = 1 / np.sqrt(np.diag(known))
+    information = np.linalg.inv(known * np.outer(scale, scale)) * np.outer(scale, scale)
     candidates = {words: _information(calibration, pose, free, prior) for words, pose in _candidate_poses(calibration).items()}
     distance = distance_mm or working_distance_mm(calibration)
     out: list[Suggestion] = []
@@ -110,20 +111,22 @@ def _candidate_poses(calibration: Calibration) -> dict[str, tuple[Array, Array]]
     return poses
 
 
-def _information(calibration: Calibration, pose: tuple[Array, Array], free: NDArray[np.bool_], prior: ba.Prior) -> Array:
+def _information(calibration: Calibration, pose: tuple[Array, Array], free: NDArray[np.bool_], prior: Prior) -> Array:
     """What one more view of the whole board adds to the information on the shared parameters."""
-    board = np.unique(np.concatenate([view.board_mm for view in calibration.views]).round(6), axis=0)
-    bundle = replace(calibration.bundle, rotation=pose[0][None], translation_mm=pose[1][None])
+    known, board = calibration.bundle, calibration.board
+    bundle = replace(known, rotation=pose[0][None], translation_mm=pose[1][None], motion=np.zeros((1, 6)))
+    points = board.points_mm
     corners = BoardCorners(
-        np.zeros((len(board), 2)), board, np.array([0, len(board)]), bends_of(board, calibration.board.middle_mm, calibration.board.half_mm)
+        *(np.zeros((len(points), 2)), points, np.array([0, len(points)]), shapes_of(points, board.middle_mm, board.half_mm)),
+        *(np.arange(len(points)), np.zeros(len(points)), board.middle_mm),
     )
     pixels = -bundle.residuals(corners)
     seen = np.isfinite(pixels).all(axis=1) & bundle.camera.contains(pixels)
     size = int(free.sum())
     if seen.mean() < FEWEST_VISIBLE:
         return np.zeros((size, size))
-    equations = ba.normal_equations(bundle, corners, free, seen.astype(float), prior)
-    return np.asarray(ba.reduced(equations)[0][0])
+    at_rest = replace(prior, print_mm=0.0, motion=None)
+    return np.asarray(el.reduced(el.normal_equations(bundle, corners, free, seen.astype(float), at_rest))[0][0])
 
 
 def _error(camera: Camera, information: Array, noise_px: float, distance_mm: float) -> float:

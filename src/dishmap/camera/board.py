@@ -1,7 +1,8 @@
-"""A calibration board: what was seen of it in each photograph, how it may bend, and where its circles' outlines lie.
+"""A calibration board: what was seen of it in each photograph, how it may deform, and where its circles' outlines lie.
 
 Boards are a sheet on a plate: they bow. A bend is a smooth height over the flat board that is the same in all views; without
 it a bow of half a millimetre goes into the lens (mrcal measures it as a parabola along two sides; here it may also be twisted).
+Printers stretch: one side by a part in a thousand against the other; and each printed point has a small error of its own.
 """
 
 from __future__ import annotations
@@ -19,6 +20,9 @@ Array = NDArray[np.float64]
 
 # x^i y^j of the bends by name; degree 2 is what bowing and twisting look like
 BENDS = {"bow_x": (2, 0), "twist": (1, 1), "bow_y": (0, 2)}
+# Terms in the plane: x longer and y shorter, and the right angle lost. How large all of it is printed, no photograph can tell.
+STRETCHES = ("stretch", "skew")
+SHAPE_TERMS = (*BENDS, *STRETCHES)
 # A circle's outline is followed through the lens at so many points: its centre is then right to 1e-5 of its radius.
 OUTLINE_POINTS = 24
 
@@ -86,6 +90,26 @@ def bends_of(board_mm: Array, middle_mm: Array, half_mm: float) -> Array:
     return np.stack([x**i * y**j for i, j in BENDS.values()], axis=-1)
 
 
+def shapes_of(board_mm: Array, middle_mm: Array, half_mm: float) -> Array:
+    """How far points board_mm (N, 3) move for each term of SHAPE_TERMS of size 1 mm (N, 3, F): heights by `bends_of`, then in the plane.
+
+    A stretch of size b mm makes the half side longer by b along x and shorter along y; a skew moves the end of the half side by b sideways.
+    """
+    out = np.zeros((len(board_mm), 3, len(SHAPE_TERMS)))
+    out[:, 2, : len(BENDS)] = bends_of(board_mm, middle_mm, half_mm)
+    x, y = ((board_mm[:, :2] - middle_mm) / half_mm).T
+    out[:, :2, len(BENDS)] = np.stack([x, -y], axis=-1)
+    out[:, :2, len(BENDS) + 1] = np.stack([y, x], axis=-1)
+    return out
+
+
+def point_index(points_mm: Array, board_mm: Array) -> NDArray[np.int64]:
+    """Which of a board's points (N, 3) each of board_mm (M, 3) is."""
+    from scipy.spatial import cKDTree
+
+    return np.asarray(cKDTree(points_mm).query(board_mm)[1], dtype=np.int64)
+
+
 def outline_shift(camera: Camera, points: Array, axes: Array, radius_mm: Array) -> Array:
     """How far the centre of a circle's outline lies from the image of its centre (N, 2), px.
 
@@ -109,27 +133,37 @@ def outline_shift(camera: Camera, points: Array, axes: Array, radius_mm: Array) 
 
 @dataclass(frozen=True)
 class BoardShape:
-    """How a board is bent, as learnt from all views together.
+    """How a board is deformed, as learnt from all views together.
 
-    middle_mm (2,), half_mm: see `board_frame`; bend_mm (F,) and covariance_mm2 (F, F) in the order of BENDS. free: false where the
-    board was taken as flat, with bends of zero.
+    middle_mm (2,), half_mm: see `board_frame`; shape_mm (F,) and covariance_mm2 (F, F) in the order of SHAPE_TERMS. points_mm (N, 3): the
+    board's points; print_mm (N, 2): how far each was printed off its place, none or all zero where that is not seen; print_sigma_mm:
+    how far a point of this print typically is off. free: false where the board was taken as exact.
     """
 
     middle_mm: Array
     half_mm: float
-    bend_mm: Array
+    shape_mm: Array
     covariance_mm2: Array
+    points_mm: Array
+    print_mm: Array
+    print_sigma_mm: float = 0.0
     free: bool = True
 
     @property
+    def bend_mm(self) -> Array:
+        """Sizes of the bends (3,) in the order of BENDS."""
+        return self.shape_mm[: len(BENDS)]
+
+    @property
     def sigma_mm(self) -> Array:
-        """Standard deviations of the bends (F,)."""
-        return np.asarray(np.sqrt(np.diag(self.covariance_mm2)))
+        """Standard deviations of the bends (3,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance_mm2)))[: len(BENDS)]
 
     def bent(self, board_mm: Array) -> Array:
-        """Points (N, 3) of the flat board as they lie on the bent one."""
+        """Points (N, 3) of the board as designed as they lie on the real one."""
         out = np.array(board_mm, dtype=float)
-        out[:, 2] += bends_of(out, self.middle_mm, self.half_mm) @ self.bend_mm
+        out += shapes_of(out, self.middle_mm, self.half_mm) @ self.shape_mm
+        out[:, :2] += self.print_mm[point_index(self.points_mm, board_mm)]
         return out
 
     @property

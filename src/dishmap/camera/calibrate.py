@@ -15,17 +15,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dishmap.camera import bundle as ba
-from dishmap.camera.board import BENDS, BoardShape, BoardView
-from dishmap.camera.bundle import BoardCorners, Bundle
+from dishmap.camera import elimination as el
+from dishmap.camera.adjustment import ROUNDING_PX
+from dishmap.camera.board import SHAPE_TERMS, BoardShape, BoardView
+from dishmap.camera.bundle import Bundle
+from dishmap.camera.learning import learnt
 from dishmap.camera.model import Camera
 from dishmap.camera.planar import planar_poses
-from dishmap.camera.problem import Problem, problem_of
+from dishmap.camera.problem import READOUTS, Problem, problem_of
 from dishmap.camera.screening import CHECK_INPUT, FEWEST_VIEWS, corner_weights, outlier_names, screened
 from dishmap.errors import FitError, InputError, MeasurementError
 from dishmap.transforms import Pose, angle_between_rad
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Screened = tuple[Problem, Bundle, tuple[Mask, ...], Array, dict[str, str]]
 
 # name -> lens model and number of coefficients
 LENSES = {
@@ -67,7 +71,9 @@ class Calibration:
     used corners, as OpenCV's. sigma_px: noise of one coordinate. inflation: factor by which sigmas were enlarged, on
     average, for correlation within views. coverage: part of the picture where corners were seen. rejected: name and reason of
     views left out. notes: sentences on what makes this calibration weak. board: how the board is bent. expected (P,): what the
-    prior on the camera is about. independent: part of the noise that was taken as independent from corner to corner.
+    prior on the camera is about. independent: part of the noise that was taken as independent from corner to corner. readout: how a
+    picture was read; motion (V, 6): by how much the board turned about its middle (radians) and moved (mm) meanwhile, in the camera's
+    frame; motion_sigma_mm: how far it typically moved.
     """
 
     camera: Camera
@@ -87,6 +93,9 @@ class Calibration:
     board: BoardShape
     expected: Array
     independent: float
+    readout: str
+    motion: Array
+    motion_sigma_mm: float
 
     @property
     def view_names(self) -> tuple[str, ...]:
@@ -102,13 +111,15 @@ class Calibration:
     @property
     def problem(self) -> Problem:
         """The least-squares problem that this calibration solves."""
-        return Problem(self.views, self.board.middle_mm, self.board.half_mm, self.expected, not self.board.free)
+        size, board = (self.camera.width_px, self.camera.height_px), self.board
+        frame = (board.middle_mm, board.half_mm, board.points_mm, self.expected, not board.free, self.readout)
+        return Problem(self.views, size, *frame, self.sigma_px, board.print_sigma_mm, self.motion_sigma_mm)
 
     @property
     def bundle(self) -> Bundle:
         """Its solution."""
         rotation, translation = np.stack([p.rotation for p in self.poses]), np.stack([p.translation_mm for p in self.poses])
-        return Bundle(replace(self.camera, covariance=None), rotation, translation, self.board.bend_mm)
+        return Bundle(replace(self.camera, covariance=None), rotation, translation, self.board.shape_mm, self.board.print_mm, self.motion)
 
     @property
     def weights(self) -> Array:
@@ -116,27 +127,40 @@ class Calibration:
         return corner_weights(self.used, self.view_weight)
 
 
-def calibrate(views: Sequence[BoardView], width_px: int, height_px: int, lens: str = "opencv5", flat: bool = False) -> Calibration:
+def calibrate(
+    views: Sequence[BoardView], width_px: int, height_px: int, lens: str = "opencv5", flat: bool = False, readout: str = "global"
+) -> Calibration:
     """Calibrate a camera from views of a board.
 
     views: corners and where they are printed, at least 3 views in different directions. width_px, height_px: size of the
-    photographs. lens: one of LENSES (`opencv5` has k1, k2, p1, p2, k3). flat: the board is flat (glass), its bends are zero;
-    otherwise they are learnt. Raises InputError for impossible input; MeasurementError (or FitError) when the views do not determine a
-    camera.
+    photographs. lens: one of LENSES (`opencv5` has k1, k2, p1, p2, k3). flat: the board is flat and its print exact (glass); otherwise
+    its bends, stretch and printed errors are learnt. readout: "rows" or "columns" where a picture is read line by line while the board
+    may move, in which case a motion is learnt for each view. Raises InputError for impossible input; MeasurementError (or FitError) when
+    the views do not determine a camera.
     """
     if lens not in LENSES:
         raise InputError(f"unknown lens {lens!r}; use one of {', '.join(LENSES)}")
+    if readout not in READOUTS:
+        raise InputError(f"unknown readout {readout!r}; use one of {', '.join(READOUTS)}")
     model, count = LENSES[lens]
     camera = Camera(width_px, height_px, np.full(2, float(width_px)), np.array([width_px - 1, height_px - 1]) / 2, np.zeros(count), model)
     _check_views(views, camera)
-    problem = problem_of(views, camera.parameters, flat)
-    bundle = _start(camera, problem.joined())
+    problem = problem_of(views, camera, flat, readout)
+    bundle = _start(camera, problem)
     problem = replace(problem, expected=bundle.camera.parameters)
     first = np.zeros(len(bundle.shared), dtype=bool)
     first[[0, 1, 4, 5]] = True  # first what bends most: focal lengths and two radial terms
     for free in (first, problem.free(bundle)):
         bundle = problem.solve(bundle, free=free, robust=True)
-    return _result(*screened(problem, bundle), lens)
+    return _result(*_learnt(*screened(problem, bundle)), lens)
+
+
+def _learnt(problem: Problem, bundle: Bundle, used: tuple[Mask, ...], weight: Array, rejected: dict[str, str]) -> Screened:
+    """Learn noise, print errors and motions, then screen again: against what is left, outliers stand out more."""
+    problem, bundle = learnt(problem, bundle, corner_weights(used, weight))
+    problem, bundle, used, weight, more = screened(problem, bundle, near=True)
+    problem, bundle = learnt(problem, bundle, corner_weights(used, weight))
+    return problem, bundle, used, weight, rejected | more
 
 
 def _check_views(views: Sequence[BoardView], camera: Camera) -> None:
@@ -158,8 +182,9 @@ def _check_views(views: Sequence[BoardView], camera: Camera) -> None:
             raise InputError(f"the corners of view {view.name} are not spread over a flat board in x and y (z = 0)")
 
 
-def _start(camera: Camera, corners: BoardCorners) -> Bundle:
+def _start(camera: Camera, problem: Problem) -> Bundle:
     """The focal length, of a list, with which planar poses fit the typical corner best, and these poses."""
+    corners = problem.joined
     best: tuple[float, Bundle] | None = None
     for ratio in START_FOCAL[camera.model]:
         focal = np.full(2, ratio * max(camera.width_px, camera.height_px))
@@ -167,7 +192,7 @@ def _start(camera: Camera, corners: BoardCorners) -> Bundle:
         rays = trial.unproject(corners.pixels)
         if not np.isfinite(rays).all():
             continue
-        bundle = Bundle(trial, *planar_poses(rays, corners.board_mm, corners.bounds[:-1]), np.zeros(len(BENDS)))
+        bundle = problem.start(trial, *planar_poses(rays, corners.board_mm, corners.bounds[:-1]))
         length = np.linalg.norm(bundle.residuals(corners), axis=1)
         score = float(np.median(np.where(np.isfinite(length), length, np.inf)))
         if best is None or score < best[0]:
@@ -178,26 +203,22 @@ def _start(camera: Camera, corners: BoardCorners) -> Bundle:
     return best[1]
 
 
-def _result(
-    problem: Problem, bundle: Bundle, used: tuple[NDArray[np.bool_], ...], weight: Array, rejected: dict[str, str], lens: str
-) -> Calibration:
+def _result(problem: Problem, bundle: Bundle, used: tuple[Mask, ...], weight: Array, rejected: dict[str, str], lens: str) -> Calibration:
     corners, weights, free = problem.corners(bundle), corner_weights(used, weight), problem.free(bundle)
     residuals = bundle.residuals(corners)
     square = (residuals**2).sum(axis=1)
-    good = weights > 0
-    degrees_of_freedom = 2 * good.sum() - free.sum() - ba.POSE * len(problem.views)
-    sigma = float(np.sqrt((weights * square)[good].sum() / degrees_of_freedom))
+    good, sigma = weights > 0, problem.noise_px
     if sigma > LARGEST_SIGMA_OF_SIDE * max(bundle.camera.width_px, bundle.camera.height_px):
         raise MeasurementError(f"the best camera misses the corners by {sigma:.3g} px; {CHECK_INPUT}")
-    equations = ba.normal_equations(bundle, corners, free, weights, problem.prior(bundle, corners, weights))
+    equations = el.normal_equations(bundle, corners, free, weights, problem.prior(bundle, corners))
     _check_turn(bundle)
     covariance, inflation, independent = shared_covariance(bundle.camera, equations, sigma)
-    if ba.step_in_sigmas(equations, max(sigma, LEAST_NOISE_PX)) > LARGEST_STEP_SIGMAS:
+    if el.step_in_sigmas(equations, max(sigma, LEAST_NOISE_PX)) > LARGEST_STEP_SIGMAS:
         raise FitError("the calibration did not reach its best fit; use more views, or a lens with fewer coefficients")
     parts = [residuals[s] for s in corners.slices]
     coverage = _coverage(bundle.camera, corners.pixels[good])
-    count = len(bundle.camera.parameters)
-    bends = np.zeros((len(BENDS), len(BENDS))) if problem.flat else covariance[count:, count:]
+    count, terms = len(bundle.camera.parameters), len(SHAPE_TERMS)
+    shape = np.zeros((terms, terms)) if problem.flat else covariance[count:, count:]
     return Calibration(
         camera=replace(bundle.camera, covariance=covariance[:count, :count]),
         views=problem.views,
@@ -213,9 +234,15 @@ def _result(
         notes=(*_notes(bundle, coverage), *_unstable_focal(bundle, equations, float((weights * square)[good].sum()))),
         lens=lens,
         view_weight=weight,
-        board=BoardShape(problem.middle_mm, problem.half_mm, bundle.bend_mm, bends, not problem.flat),
+        board=BoardShape(
+            *(problem.middle_mm, problem.half_mm, bundle.shape_mm, shape, problem.points_mm, bundle.print_mm),
+            *(problem.print_mm, not problem.flat),
+        ),
         expected=problem.expected,
         independent=independent,
+        readout=problem.readout,
+        motion=bundle.motion,
+        motion_sigma_mm=problem.motion_mm,
     )
 
 
@@ -234,7 +261,7 @@ def _check_turn(bundle: Bundle) -> None:
         )
 
 
-def shared_covariance(camera: Camera, equations: ba.NormalEquations, sigma_px: float) -> tuple[Array, float, float]:
+def shared_covariance(camera: Camera, equations: el.NormalEquations, sigma_px: float) -> tuple[Array, float, float]:
     """Covariance of camera parameters and bends with the poses marginalised out; factor of its sigmas; independent part of the noise.
 
     The factor is by how much clustering of the noise within views enlarges sigmas on average.
@@ -242,16 +269,21 @@ def shared_covariance(camera: Camera, equations: ba.NormalEquations, sigma_px: f
     its leverage (CR2 of Bell and McCaffrey 2002: unbiased if corners are independent). With 10 to 20 views the sum is noisy, so it is
     shrunk towards a multiple of the unit matrix by the amount that its own scatter calls for (Ledoit and Wolf 2004).
     """
-    matrices, sides, _, _ = ba.reduced(equations)
-    information = matrices.sum(axis=0) + np.diag(equations.prior)
-    scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
-    root = scale[:, None] * vectors / np.sqrt(np.maximum(values, 1e-30))  # root @ root.T inverts the information
+    known = el.marginals(equations)
+    scale = np.sqrt(np.diag(known.covariance))
+    values, vectors = np.linalg.eigh(known.covariance / np.outer(scale, scale))
+    values = np.maximum(values, 1e-30)
+    root = scale[:, None] * vectors * np.sqrt(values)  # root @ root.T is the covariance for noise of 1 px
     _check_determined(camera, root, max(sigma_px, LEAST_NOISE_PX))
     if sigma_px < LEAST_NOISE_PX * 1e-6:  # simulated corners without noise: there is nothing to learn about correlation
         return sigma_px**2 * root @ root.T, 1.0, 1.0
-    scores = sides @ root / sigma_px
-    leverage, axes = np.linalg.eigh(np.swapaxes(root, 0, 1) @ matrices @ root)
+    influence = known.influence / scale @ vectors / np.sqrt(values)
+    views = range(len(equations.shared))
+    scores = (
+        np.stack([np.einsum("mij,mi->j", influence[at], equations.residual[at]) for at in (equations.view == v for v in views)]) / sigma_px
+    )
+    weighed = np.stack([np.einsum("mij,mik->jk", influence[at], influence[at]) for at in (equations.view == v for v in views)])
+    leverage, axes = np.linalg.eigh(weighed)
     scores = np.einsum("vij,vj,vkj,vk->vi", axes, 1 / np.sqrt(np.maximum(1 - leverage, 1e-6)), axes, scores)
     spread = scores.T @ scores
     count, size = scores.shape
@@ -275,14 +307,14 @@ def _check_determined(camera: Camera, root: Array, noise_px: float) -> None:
         )
 
 
-def _unstable_focal(bundle: Bundle, equations: ba.NormalEquations, cost_px2: float) -> tuple[str, ...]:
+def _unstable_focal(bundle: Bundle, equations: el.NormalEquations, cost_px2: float) -> tuple[str, ...]:
     """A note if a focal length of its own for each view would explain much of what is left: autofocus does that."""
-    matrices, sides, _, _ = ba.reduced(equations)
+    matrices, sides, _, _ = el.reduced(equations)
     along = np.zeros(matrices.shape[-1])
     along[:2] = bundle.camera.focal_px / bundle.camera.focal_px.mean()
     side, information = sides @ along, np.maximum(along @ matrices @ along, 1e-300)
     explained = float((side**2 / information).sum() / max(cost_px2, 1e-300))
-    if explained < UNSTABLE_PART or cost_px2 < len(sides) * ba.ROUNDING_PX:
+    if explained < UNSTABLE_PART or cost_px2 < len(sides) * ROUNDING_PX:
         return ()
     spread = float(np.std(side / information) / bundle.camera.focal_px.mean())
     return (

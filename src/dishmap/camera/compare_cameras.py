@@ -123,7 +123,7 @@ def halves_of(calibration: Calibration, distance_mm: float | None = None) -> Hal
     camera = calibration.camera
     try:
         made = [
-            calibrate(half, camera.width_px, camera.height_px, calibration.lens, not calibration.board.free)
+            calibrate(half, camera.width_px, camera.height_px, calibration.lens, not calibration.board.free, calibration.readout)
             for half in split_views(calibration.views)
         ]
     except DishmapError:

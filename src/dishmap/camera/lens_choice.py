@@ -1,19 +1,22 @@
 """Which lens model the photographs call for: the leanest whose error on views that were left out is as small as any.
 
 More coefficients always fit the views better that they were fitted to. Whether they describe the lens shows on views that they
-never saw: the camera and the board's bends are fitted to the others, and only the pose of each held-out view is its own.
+never saw: the camera and the board are fitted to the others, and only the pose of each held-out view is its own. Whether pictures were
+read line by line while the board moved shows in the residuals: a motion in each view then explains much of them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dishmap.camera import elimination as el
 from dishmap.camera.board import BoardView
 from dishmap.camera.calibrate import WEAK_TURN_RAD, Calibration, calibrate, largest_turn_rad
+from dishmap.camera.problem import READOUTS
 from dishmap.errors import CameraError, MeasurementError
 
 Array = NDArray[np.float64]
@@ -24,6 +27,8 @@ CANDIDATES = ("opencv5", "fisheye", "opencv8", "opencv12")
 FOLDS = 4
 # Fewer views leave too few to fit to.
 FEWEST_VIEWS = 8
+# Motions that explain less than this part of the squared residuals, over what they would of pure noise, are not looked for.
+MOTION_PART = 0.2
 # A leaner lens is as good when it is worse by less than one standard error over the views, or by less than this part.
 SAME_PART = 0.01
 
@@ -40,38 +45,68 @@ class Trial:
 
 @dataclass(frozen=True)
 class LensChoice:
-    """The lens chosen, every trial from lean to rich, and the reason in a sentence."""
+    """The lens chosen, every trial from lean to rich, and the reason in a sentence; for the readout too, where it was looked for."""
 
     lens: str
     trials: tuple[Trial, ...]
     reason: str
+    readout_reason: str = ""
 
 
 def choose_lens(
-    views: Sequence[BoardView], width_px: int, height_px: int, flat: bool = False, progress: Progress | None = None
+    views: Sequence[BoardView], width_px: int, height_px: int, flat: bool = False, readout: str = "auto", progress: Progress | None = None
 ) -> tuple[Calibration, LensChoice]:
     """Calibrate with each lens model and return the calibration of the one chosen.
 
-    Raises InputError for impossible input, and the leanest lens's error when none can be fitted.
+    readout: as for `calibrate`, or "auto" to see whether motions explain the residuals. Raises InputError for impossible input, and the
+    leanest lens's error when none can be fitted.
     """
+    first = "global" if readout == "auto" else readout
     if len(views) < FEWEST_VIEWS:
-        only = calibrate(views, width_px, height_px, CANDIDATES[0], flat)
+        only = calibrate(views, width_px, height_px, CANDIDATES[0], flat, first)
         why = f"{len(views)} views are too few to hold some out ({FEWEST_VIEWS} are needed), so the leanest lens model was taken"
         return only, LensChoice(only.lens, (Trial(only.lens, only.rms_px, np.nan),), why)
-    leanest = _if_alike(views, width_px, height_px, flat)
+    leanest = _if_alike(views, width_px, height_px, flat, first)
     if leanest is not None:
         return leanest
+    steps = len(CANDIDATES) * (2 if readout == "auto" else 1)
+
+    def tell(done: int) -> None:
+        if progress:
+            progress(done, steps)
+
+    made, choice = _tried(views, width_px, height_px, flat, first, tell)
+    if readout != "auto":
+        return made, choice
+    readout, part = _readout(made)
+    if readout == "global":
+        why = (
+            f"pictures were taken at once, or nothing moved: motions meanwhile would explain {max(part, 0.0):.0%} of the squared residuals"
+        )
+    else:
+        still, (made, choice) = made.sigma_px, _tried(views, width_px, height_px, flat, readout, lambda done: tell(len(CANDIDATES) + done))
+        why = (
+            f"pictures were read by {readout} while board or camera moved: with a motion in each view the noise of a coordinate is "
+            f"{made.sigma_px:.2g} px, without {still:.2g} px"
+        )
+    tell(steps)
+    return made, replace(choice, readout_reason=why)
+
+
+def _tried(
+    views: Sequence[BoardView], width_px: int, height_px: int, flat: bool, readout: str, tell: Callable[[int], None]
+) -> tuple[Calibration, LensChoice]:
+    """Every lens model with one readout."""
     made: dict[str, Calibration] = {}
     problems: dict[str, MeasurementError | CameraError] = {}
     errors: dict[str, Array] = {}
     for done, lens in enumerate(CANDIDATES, start=1):
         try:
-            made[lens] = calibrate(views, width_px, height_px, lens, flat)
+            made[lens] = calibrate(views, width_px, height_px, lens, flat, readout)
             errors[lens] = held_out_errors(made[lens], [view.name for view in views])
         except (MeasurementError, CameraError) as error:
             problems[lens] = error
-        if progress:
-            progress(done, len(CANDIDATES))
+        tell(done)
     if not errors:
         raise problems[CANDIDATES[0]]
     lens, reason = _chosen(errors)
@@ -84,13 +119,30 @@ def choose_lens(
     return made[lens], LensChoice(lens, trials, reason)
 
 
-def _if_alike(views: Sequence[BoardView], width_px: int, height_px: int, flat: bool) -> tuple[Calibration, LensChoice] | None:
+def _readout(made: Calibration) -> tuple[str, float]:
+    """How pictures were read, and what part of the squared residuals motions explain so."""
+    parts = {readout: motion_part(made, readout) for readout in READOUTS[1:]}
+    best = max(parts, key=lambda readout: parts[readout])
+    return best if parts[best] > MOTION_PART else "global", parts[best]
+
+
+def motion_part(made: Calibration, readout: str) -> float:
+    """Part of the squared residuals that a motion in each view would explain, to first order, over what it would of pure noise."""
+    problem, bundle = replace(made.problem, readout=readout, motion_mm=0.1 * made.board.half_mm), made.bundle
+    corners = problem.corners(bundle)
+    equations = el.normal_equations(bundle, corners, problem.free(bundle), made.weights, problem.prior(bundle, corners))
+    _, gain = el.best_step(equations)
+    cost, count = float((equations.residual**2).sum()), 2 * float((made.weights > 0).sum())
+    return (gain / cost if cost > 0 else 0.0) - bundle.motion.size / count
+
+
+def _if_alike(views: Sequence[BoardView], width_px: int, height_px: int, flat: bool, readout: str) -> tuple[Calibration, LensChoice] | None:
     """The leanest lens where all views show the board from nearly one side.
 
     Errors of the print then lie at the same places of all pictures, and a richer lens would learn them, held-out views or not.
     """
     try:
-        only = calibrate(views, width_px, height_px, CANDIDATES[0], flat)
+        only = calibrate(views, width_px, height_px, CANDIDATES[0], flat, readout)
     except (MeasurementError, CameraError):
         return None
     turn = largest_turn_rad(only.bundle)
@@ -104,7 +156,10 @@ def _if_alike(views: Sequence[BoardView], width_px: int, height_px: int, flat: b
 
 
 def held_out_errors(calibration: Calibration, names: Sequence[str]) -> Array:
-    """Rms residual (V,), px, of each view named when camera and bends come from views of other folds; NaN for views not used."""
+    """Rms residual (V,), px, of each view named when camera and board come from views of other folds; NaN for views not used.
+
+    What the view's own pose and motion take out of its residuals is put back.
+    """
     problem, bundle = calibration.problem, calibration.bundle
     number = {name: i for i, name in enumerate(names)}
     fold = np.array([number[name] % FOLDS for name in calibration.view_names])
@@ -116,15 +171,16 @@ def held_out_errors(calibration: Calibration, names: Sequence[str]) -> Array:
             continue
         train = [i for i in range(len(fold)) if fold[i] != k]
         weights = np.concatenate([used[i] * calibration.view_weight[i] for i in train])
-        fitted = problem.of_views([problem.views[i] for i in train]).solve(bundle.of_views(fold != k), weights)
-        rest = problem.of_views([problem.views[i] for i in held])
-        start = bundle.of_views(fold == k).with_shared(fitted.shared)
+        fitted = problem.of_views([problem.views[i] for i in train]).solve(bundle.of_views(fold != k), weights, near=True)
+        rest = replace(problem.of_views([problem.views[i] for i in held]), print_mm=0.0)
+        start = replace(bundle.of_views(fold == k).with_shared(fitted.shared), print_mm=fitted.print_mm)
         inside = np.concatenate([used[i] for i in held]).astype(float)
-        posed = rest.solve(start, inside, rest.free(start, camera=False))
+        posed = rest.solve(start, inside, rest.free(start, camera=False), near=True)
         corners = rest.corners(posed)
         square = (posed.residuals(corners) ** 2).sum(axis=1)
         for i, s in zip(held, corners.slices, strict=True):
-            rms = float(np.sqrt(square[s][used[i]].mean()))
+            own = 12 if problem.motion_mm else 6
+            rms = float(np.sqrt(square[s][used[i]].mean() / max(1 - own / (2 * used[i].sum()), 0.1)))
             out[number[calibration.view_names[i]]] = rms if np.isfinite(rms) else np.inf
     return out
 

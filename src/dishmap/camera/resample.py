@@ -87,8 +87,9 @@ def refit(calibration: Calibration, rng: np.random.Generator) -> Camera:
     """The camera that new noise on the fitted corners would have given."""
     problem, bundle = calibration.problem, calibration.bundle
     # residuals are smaller than the noise, as parameters were fitted to them
-    corners = sum(int(used.sum()) for used in calibration.used)
-    grow = np.sqrt(2 * corners / max(2 * corners - len(bundle.shared) - 6 * len(problem.views), 1))
+    square = np.concatenate([(residual**2).sum(axis=1) for residual in calibration.residuals_px])
+    good = calibration.weights > 0
+    grow = calibration.sigma_px * np.sqrt(2 * good.sum() / (calibration.weights * square)[good].sum())
     grow *= np.sqrt(len(problem.views) / (len(problem.views) - 1))
     common = np.sqrt(1 - calibration.independent) * grow
     own = np.sqrt(calibration.independent) * calibration.sigma_px * calibration.inflation
@@ -96,7 +97,7 @@ def refit(calibration: Calibration, rng: np.random.Generator) -> Camera:
         _drawn(view, residual, common * rng.choice([-1.0, 1.0]), own / np.sqrt(weight), rng)
         for view, residual, weight in zip(calibration.views, calibration.residuals_px, calibration.view_weight, strict=True)
     ]
-    return problem.of_views(views).solve(bundle, calibration.weights).camera
+    return problem.of_views(views).solve(bundle, calibration.weights, near=True).camera
 
 
 def _drawn(view: BoardView, residual: Array, sign: float, sigma_px: float, rng: np.random.Generator) -> BoardView:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dishmap.camera import bundle as ba
+from dishmap.camera import adjustment as ba
 from dishmap.camera.board import BoardView
 from dishmap.camera.bundle import Bundle
 from dishmap.camera.problem import Problem
@@ -28,11 +28,11 @@ MOST_ROUNDS = 20
 CHECK_INPUT = "are corners and board in the same order, and all photographs by one camera with fixed focus and zoom?"
 
 
-def screened(problem: Problem, bundle: Bundle) -> tuple[Problem, Bundle, tuple[Mask, ...], Array, dict[str, str]]:
+def screened(problem: Problem, bundle: Bundle, near: bool = False) -> tuple[Problem, Bundle, tuple[Mask, ...], Array, dict[str, str]]:
     """Least squares over what fits: views and corners that do not are left out, until the choice no longer changes.
 
     Returns the problem and bundle of the views kept, which corners of each are used, the weight of each view (V,), and name and
-    reason of the views left out. Raises MeasurementError when fewer than 3 views fit together.
+    reason of the views left out. near: the bundle is near the answer. Raises MeasurementError when fewer than 3 views fit together.
     """
     rejected: dict[str, str] = {}
     used: list[Mask] = []
@@ -50,9 +50,9 @@ def screened(problem: Problem, bundle: Bundle) -> tuple[Problem, Bundle, tuple[M
         problem = problem.of_views([view for view, k in zip(problem.views, keep, strict=True) if k])
         if not bad and len(before) == len(used) and all((a == b).all() for a, b in zip(before, used, strict=True)):
             break
-        bundle = problem.solve(bundle.of_views(keep), corner_weights(used, weight))
+        bundle = problem.solve(bundle.of_views(keep), corner_weights(used, weight), near=near)
     # the prior is only as weak as the noise is small, and the noise is known now
-    return problem, problem.solve(bundle, corner_weights(used, weight)), tuple(used), weight, rejected
+    return problem, problem.solve(bundle, corner_weights(used, weight), near=near), tuple(used), weight, rejected
 
 
 def corner_weights(used: Sequence[Mask], view_weight: Array) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,25 +24,43 @@ if TYPE_CHECKING:
     from dishmap.sheet.boards import CornerBoard
     from dishmap.targets.pattern import Pattern
 
-# Tests hold these to `dishmap.camera.calibrate.LENSES` and `dishmap.io.camera_formats.SUFFIXES`, which are not loaded for a help text.
+# Tests hold these to `dishmap.camera.calibrate.LENSES`, `dishmap.camera.problem.READOUTS` and `dishmap.io.camera_formats.SUFFIXES`, which
+# are not loaded for a help text.
 LENSES = {"4": "opencv4", "5": "opencv5", "8": "opencv8", "12": "opencv12", "fisheye": "fisheye"}
 FORMATS = ("ros", "mrcal", "kalibr")
+READOUTS = ("global", "rows", "columns")
 # The resampling draws the same noise every time, so that the same photographs give the same page.
 SEED = 1
 # Of photographs left out, so many are named in an error.
 LISTED = 3
 
 
+@dataclass(frozen=True)
+class Solver:
+    """How the camera is solved for, as the options say."""
+
+    lens: str
+    flat: bool
+    readout: str
+
+
 @click.command("calibrate")
 @click.argument("photos", nargs=-1, required=True, type=PATH, metavar="PHOTOS...")
 @board_options
-@click.option("--flat-board", is_flag=True, help="The board is flat (glass): do not allow for a bend.")
+@click.option("--flat-board", is_flag=True, help="The board is flat and printed exactly (glass): learn no bend, stretch or print error.")
 @click.option(
     "--lens",
     type=click.Choice(["auto", *LENSES]),
     default="auto",
     show_default=True,
     help="Number of OpenCV's lens coefficients, or fisheye; auto takes the leanest that is as good as any on views held out.",
+)
+@click.option(
+    "--readout",
+    type=click.Choice(["auto", *READOUTS]),
+    default="auto",
+    show_default=True,
+    help="How the camera reads a picture: all at once (global shutter, or nothing moves), or by rows or columns while the board moves.",
 )
 @click.option("--format", "formats", type=click.Choice(FORMATS), multiple=True, help="Write the camera for another program too.")
 @click.option("--working-mm", type=POSITIVE, help="How far away you will measure: errors are stated for there.  [default: at the boards]")
@@ -52,6 +70,7 @@ def calibrate_command(
     board: str,
     flat_board: bool,
     lens: str,
+    readout: str,
     formats: Sequence[str],
     working_mm: float | None,
     out: Path,
@@ -72,7 +91,7 @@ def calibrate_command(
         check_target(file)
     with output_folder(out.parent):
         names = _names(photos)
-        result, choice, not_found = _calibrated(what, photos, names, lens, flat_board)
+        result, choice, not_found = _calibrated(what, photos, names, Solver(lens, flat_board, readout))
         texts = {form: camera_in_format(result.camera, form, out.stem) for form in files}
         checks = replace(_checks(result, choice, working_mm), not_found=not_found)
         made = {out.name: camera_text(result.camera, result), **{files[form].name: text for form, text in texts.items()}}
@@ -104,7 +123,7 @@ def _photographs(photos: Sequence[Path], names: Sequence[str]) -> Iterator[tuple
 
 
 def _calibrated(
-    board: Pattern | CornerBoard, photos: Sequence[Path], names: Sequence[str], lens: str, flat: bool
+    board: Pattern | CornerBoard, photos: Sequence[Path], names: Sequence[str], solver: Solver
 ) -> tuple[Calibration, LensChoice | None, dict[str, str]]:
     """The calibration, why its lens was chosen, and the photographs without a board."""
     from dishmap.camera.charuco import find_charuco_boards
@@ -112,7 +131,7 @@ def _calibrated(
     from dishmap.targets.pattern import Pattern
 
     if isinstance(board, Pattern):
-        return _from_circles(board, photos, names, lens, flat)
+        return _from_circles(board, photos, names, solver)
     with progress("looking for the board") as tell:
         given = _photographs(photos, names)
         if board.dictionary is None or board.marker_mm is None:
@@ -121,11 +140,11 @@ def _calibrated(
             marker_mm = sum(board.marker_mm) / 2  # the marks name the corners and are not measured
             search = find_charuco_boards(given, board.corners, board.square_mm, marker_mm, board.dictionary, len(photos), tell)
     _check_enough(len(search.views), search.rejected)
-    return *_solved(search.views, search.width_px, search.height_px, lens, flat), search.rejected
+    return *_solved(search.views, search.width_px, search.height_px, solver), search.rejected
 
 
 def _from_circles(
-    pattern: Pattern, photos: Sequence[Path], names: Sequence[str], lens: str, flat: bool
+    pattern: Pattern, photos: Sequence[Path], names: Sequence[str], solver: Solver
 ) -> tuple[Calibration, LensChoice | None, dict[str, str]]:
     from dishmap.camera.circle_board import find_circle_boards, measured_views
 
@@ -133,12 +152,12 @@ def _from_circles(
         search = find_circle_boards(_photographs(photos, names), pattern, len(photos), tell)
     found = search.found
     _check_enough(len(found.views), found.rejected)
-    rough, _ = _solved(found.views, found.width_px, found.height_px, lens, flat)
+    rough, _ = _solved(found.views, found.width_px, found.height_px, solver)
     with progress("measuring the targets") as tell:
         views, lost = measured_views(_photographs(photos, names), pattern, search, rough, len(photos), tell)
     left_out = {**found.rejected, **rough.rejected, **lost}
     _check_enough(len(views), left_out)
-    return *_solved(views, found.width_px, found.height_px, lens, flat), left_out
+    return *_solved(views, found.width_px, found.height_px, solver), left_out
 
 
 def _check_enough(count: int, left_out: dict[str, str]) -> None:
@@ -154,14 +173,18 @@ def _check_enough(count: int, left_out: dict[str, str]) -> None:
         )
 
 
-def _solved(views: Sequence[BoardView], width_px: int, height_px: int, lens: str, flat: bool) -> tuple[Calibration, LensChoice | None]:
+def _solved(views: Sequence[BoardView], width_px: int, height_px: int, solver: Solver) -> tuple[Calibration, LensChoice | None]:
     from dishmap.camera.calibrate import calibrate
-    from dishmap.camera.lens_choice import choose_lens
+    from dishmap.camera.lens_choice import choose_lens, likely_readout
 
-    if lens != "auto":
-        return calibrate(views, width_px, height_px, LENSES[lens], flat), None
+    if solver.lens != "auto":
+        lens, readout = LENSES[solver.lens], "global" if solver.readout == "auto" else solver.readout
+        made = calibrate(views, width_px, height_px, lens, solver.flat, readout)
+        if solver.readout == "auto" and (moving := likely_readout(made)[0]) != readout:
+            made = calibrate(views, width_px, height_px, lens, solver.flat, moving)
+        return made, None
     with progress("trying lens models") as tell:
-        return choose_lens(views, width_px, height_px, flat, tell)
+        return choose_lens(views, width_px, height_px, solver.flat, solver.readout, tell)
 
 
 def _checks(result: Calibration, choice: LensChoice | None, working_mm: float | None) -> Checks:
@@ -211,6 +234,8 @@ def _report(result: Calibration, checks: Checks, names: Sequence[str], files: Se
     say(headline(result, checks))
     if checks.choice is not None:
         say(f"lens: {checks.choice.reason}")
+        if checks.choice.readout_reason:
+            say(f"readout: {checks.choice.readout_reason}")
     assert camera.covariance is not None
     sigmas = np.sqrt(np.diag(camera.covariance))
     values = zip(camera.parameter_names, camera.parameters, sigmas, strict=True)

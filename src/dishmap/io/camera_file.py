@@ -2,8 +2,8 @@
 
 Keys that OpenCV's calibration programs write: image_width, image_height, camera_matrix, distortion_coefficients. Ours beside
 them: model (`opencv` or `fisheye`), parameter_names and parameter_covariance, and of a calibration its rms, the rms and weight of
-each view, the board's bends, the corners it was made from, and what was left out. Other keys are passed over, since OpenCV's files
-have many.
+each view, the board's shape and print, motions during the readout, the corners it was made from, and what was left out. Other keys are
+passed over, since OpenCV's files have many.
 
 The parser is our own: it reads no more than such files need, exactly, and a hostile file meets Python instead of C++.
 """
@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dishmap.camera.board import BENDS, BoardView
+from dishmap.camera.board import SHAPE_TERMS, BoardView
 from dishmap.camera.calibrate import Calibration
 from dishmap.camera.model import Camera
 from dishmap.errors import CameraError, InputError
@@ -124,9 +124,13 @@ def _calibration_lines(calibration: Calibration) -> list[str]:
         *_matrix_lines("view_rms_px", calibration.view_rms_px[None, :]),
         _strings("rejected_views", (f"{name}: {reason}" for name, reason in calibration.rejected.items())),
         *_matrix_lines("view_weight", calibration.view_weight[None, :]),
-        f"board_bend_names: [ {', '.join(BENDS)} ]",
-        *_matrix_lines("board_bend_mm", board.bend_mm[None, :]),
-        *_matrix_lines("board_bend_sigma_mm", board.sigma_mm[None, :]),
+        f"board_shape_names: [ {', '.join(SHAPE_TERMS)} ]",
+        *_matrix_lines("board_shape_mm", board.shape_mm[None, :]),
+        *_matrix_lines("board_shape_sigma_mm", np.sqrt(np.diag(board.covariance_mm2))[None, :]),
+        f"board_print_sigma_mm: {_number(board.print_sigma_mm)}",
+        *(_matrix_lines("board_print_mm", np.concatenate([board.points_mm, board.print_mm], axis=1)) if board.print_sigma_mm else []),
+        f"calibration_readout: {calibration.readout}",
+        *(_matrix_lines("view_motion", calibration.motion) if calibration.motion_sigma_mm else []),
         *_matrix_lines("corner_view", index[:, None], "i"),
         *_matrix_lines("corner_used", np.concatenate(calibration.used)[:, None], "i"),
         *_matrix_lines("corners", np.concatenate(corners)),
