@@ -59,6 +59,9 @@ WEAK_VIEWS, WEAK_COVERAGE = 8, 0.4
 # 100 explains 1 %, and of boards bent anew in each view some 5 %.
 UNSTABLE_PART = 0.2
 COVERAGE_CELLS = 8
+# Noise is taken as independent until views' scores are this many sigmas larger or smaller than independent noise makes them: to enlarge
+# sigmas by chance whenever scores happen to be large would make them 3 % too large on average.
+CLUSTERED_SIGMAS = 2.0
 
 
 @dataclass(frozen=True)
@@ -267,7 +270,8 @@ def shared_covariance(camera: Camera, equations: el.NormalEquations, sigma_px: f
     The factor is by how much clustering of the noise within views enlarges sigmas on average.
     In coordinates where independent noise gives the unit matrix, each view adds the outer product of its score, adjusted for
     its leverage (CR2 of Bell and McCaffrey 2002: unbiased if corners are independent). With 10 to 20 views the sum is noisy, so it is
-    shrunk towards a multiple of the unit matrix by the amount that its own scatter calls for (Ledoit and Wolf 2004).
+    shrunk towards a multiple of the unit matrix by the amount that its own scatter calls for (Ledoit and Wolf 2004). Where its trace is
+    what independent noise makes it, nothing is enlarged.
     """
     known = el.marginals(equations)
     scale = np.sqrt(np.diag(known.covariance))
@@ -288,6 +292,8 @@ def shared_covariance(camera: Camera, equations: el.NormalEquations, sigma_px: f
     spread = scores.T @ scores
     count, size = scores.shape
     mean = float(np.trace(spread)) / size
+    if abs(mean - 1) < CLUSTERED_SIGMAS * np.sqrt(2 * (leverage**2).sum()) / size:
+        return sigma_px**2 * (root @ root.T), 1.0, 1.0
     distance = float(((spread - mean * np.eye(size)) ** 2).sum())
     scatter = sum(float(((np.outer(s, s) * count - spread) ** 2).sum()) for s in scores) / count**2
     part = min(1.0, scatter / max(distance, 1e-300))

@@ -29,8 +29,9 @@ FOLDS = 4
 FEWEST_VIEWS = 8
 # Motions that explain less than this part of the squared residuals, over what they would of pure noise, are not looked for.
 MOTION_PART = 0.2
-# A leaner lens is as good when it is worse by less than one standard error over the views, or by less than this part.
-SAME_PART = 0.01
+# A leaner lens is as good when it is worse by less than one standard error over the views, or by less than this part: then its own error
+# is under a quarter of a corner's noise, less than what loosely determined coefficients do elsewhere in the picture.
+SAME_PART = 0.03
 
 
 @dataclass(frozen=True)
@@ -66,10 +67,12 @@ def choose_lens(
         only = calibrate(views, width_px, height_px, CANDIDATES[0], flat, first)
         why = f"{len(views)} views are too few to hold some out ({FEWEST_VIEWS} are needed), so the leanest lens model was taken"
         return only, LensChoice(only.lens, (Trial(only.lens, only.rms_px, np.nan),), why)
-    leanest = _if_alike(views, width_px, height_px, flat, first)
-    if leanest is not None:
-        return leanest
-    steps = len(CANDIDATES) * (2 if readout == "auto" else 1)
+    leanest = _leanest(views, width_px, height_px, flat, first)
+    if leanest is not None and (turn := largest_turn_rad(leanest.bundle)) < WEAK_TURN_RAD:
+        return leanest, _because_alike(leanest, turn)
+    if readout == "auto" and leanest is not None:
+        first, _ = likely_readout(leanest)
+    steps = len(CANDIDATES) * (2 if readout == "auto" and first == "global" else 1)
 
     def tell(done: int) -> None:
         if progress:
@@ -78,19 +81,23 @@ def choose_lens(
     made, choice = _tried(views, width_px, height_px, flat, first, tell)
     if readout != "auto":
         return made, choice
-    readout, part = _readout(made)
-    if readout == "global":
-        why = (
-            f"pictures were taken at once, or nothing moved: motions meanwhile would explain {max(part, 0.0):.0%} of the squared residuals"
-        )
-    else:
-        still, (made, choice) = made.sigma_px, _tried(views, width_px, height_px, flat, readout, lambda done: tell(len(CANDIDATES) + done))
-        why = (
-            f"pictures were read by {readout} while board or camera moved: with a motion in each view the noise of a coordinate is "
-            f"{made.sigma_px:.2g} px, without {still:.2g} px"
-        )
+    before = leanest or made
+    # a lens that is too lean can hide motions
+    if first == "global" and (second := likely_readout(made)[0]) != "global":
+        before, (made, choice) = made, _tried(views, width_px, height_px, flat, second, lambda done: tell(len(CANDIDATES) + done))
     tell(steps)
-    return made, replace(choice, readout_reason=why)
+    return made, replace(choice, readout_reason=_why_readout(made, before))
+
+
+def _why_readout(made: Calibration, before: Calibration) -> str:
+    """How pictures were read, in words; before: a calibration without motions."""
+    if made.motion_sigma_mm:
+        return (
+            f"pictures were read by {made.readout} while board or camera moved: with a motion in each view the noise of a coordinate is "
+            f"{made.sigma_px:.2g} px, without {before.sigma_px:.2g} px"
+        )
+    part = 0.0 if made.readout != "global" else max(likely_readout(made)[1], 0.0)
+    return f"pictures were taken at once, or nothing moved: motions meanwhile would explain {part:.0%} of the squared residuals"
 
 
 def _tried(
@@ -119,8 +126,8 @@ def _tried(
     return made[lens], LensChoice(lens, trials, reason)
 
 
-def _readout(made: Calibration) -> tuple[str, float]:
-    """How pictures were read, and what part of the squared residuals motions explain so."""
+def likely_readout(made: Calibration) -> tuple[str, float]:
+    """How pictures were read, judged by a calibration without motions, and what part of its squared residuals motions explain."""
     parts = {readout: motion_part(made, readout) for readout in READOUTS[1:]}
     best = max(parts, key=lambda readout: parts[readout])
     return best if parts[best] > MOTION_PART else "global", parts[best]
@@ -136,23 +143,23 @@ def motion_part(made: Calibration, readout: str) -> float:
     return (gain / cost if cost > 0 else 0.0) - bundle.motion.size / count
 
 
-def _if_alike(views: Sequence[BoardView], width_px: int, height_px: int, flat: bool, readout: str) -> tuple[Calibration, LensChoice] | None:
-    """The leanest lens where all views show the board from nearly one side.
+def _leanest(views: Sequence[BoardView], width_px: int, height_px: int, flat: bool, readout: str) -> Calibration | None:
+    try:
+        return calibrate(views, width_px, height_px, CANDIDATES[0], flat, readout)
+    except (MeasurementError, CameraError):
+        return None
+
+
+def _because_alike(only: Calibration, turn_rad: float) -> LensChoice:
+    """Why the leanest lens is taken where all views show the board from nearly one side.
 
     Errors of the print then lie at the same places of all pictures, and a richer lens would learn them, held-out views or not.
     """
-    try:
-        only = calibrate(views, width_px, height_px, CANDIDATES[0], flat, readout)
-    except (MeasurementError, CameraError):
-        return None
-    turn = largest_turn_rad(only.bundle)
-    if turn >= WEAK_TURN_RAD:
-        return None
     why = (
-        f"the board's directions differ by {np.degrees(turn):.0f} degrees only, so that a richer lens model would learn the errors of the "
-        "print; the leanest was taken"
+        f"the board's directions differ by {np.degrees(turn_rad):.0f} degrees only, so that a richer lens model would learn the "
+        "errors of the print; the leanest was taken"
     )
-    return only, LensChoice(only.lens, (Trial(only.lens, only.rms_px, np.nan),), why)
+    return LensChoice(only.lens, (Trial(only.lens, only.rms_px, np.nan),), why)
 
 
 def held_out_errors(calibration: Calibration, names: Sequence[str]) -> Array:
