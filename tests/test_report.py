@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from dishmap.calibration_report import Checks, calibration_report
-from dishmap.camera.board import BENDS, BoardShape, BoardView
+from dishmap.camera.board import SHAPE_TERMS, BoardShape, BoardView
 from dishmap.camera.calibrate import Calibration
 from dishmap.camera.model import Camera
 from dishmap.errors import ImageError
@@ -350,15 +350,20 @@ def test_the_report_of_a_calibration() -> None:
         notes=("few views",),
         lens="opencv5",
         view_weight=np.ones(4),
-        board=BoardShape(np.zeros(2), 50.0, np.zeros(len(BENDS)), np.eye(len(BENDS))),
+        board=BoardShape(np.zeros(2), 50.0, np.zeros(len(SHAPE_TERMS)), np.eye(len(SHAPE_TERMS)), np.zeros((1, 3)), np.zeros((1, 2)), 0.03),
         expected=CAMERA.parameters,
         independent=1.0,
+        readout="columns",
+        motion=np.ones((4, 6)),
+        motion_sigma_mm=0.4,
     )
     html = calibration_report(calibration, HOSTILE, Checks())
     said = words(html)
     assert f"4 views fit to {number(calibration.rms_px)} px rms; corners cover 43% of the picture." in said
     assert "<bad> was left out: it is <blurred>." in said
     assert "Few views." in said
+    assert "Printed points lie 0.0300 mm (sigma of a coordinate) off their places" in said
+    assert "typical motion while a picture is read by columns, allowed for" in said
     assert ["fx", "800", "0.300", "px"] in parsed(html).rows
     assert "this radius is an expected error of" in said
     assert calibration_report(calibration, HOSTILE, Checks()) == html

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.camera.advice import Suggestion
-from dishmap.camera.board import SHAPE_TERMS
+from dishmap.camera.board import BENDS, SHAPE_TERMS
 from dishmap.camera.calibrate import Calibration
 from dishmap.camera.compare_cameras import Halves
 from dishmap.camera.lens_choice import LensChoice
@@ -27,6 +27,11 @@ LISTED = 4
 DOUBTFUL_RATIO, DOUBTFUL_SIGMAS = 1.15, 3.0
 # A board bent by more than this part of its side is worth a word, if the bend is known to be one (sigmas).
 BENT_PART, BENT_SIGMAS = 5e-4, 3.0
+SQUARE_PIXELS = "and the pixels of nearly all sensors are square"
+MEASURE_PRINT = (
+    "are the squares of the board square? Measure its scale along x and along y, and give the file that "
+    "`dishmap sheet ... --measured-mm XxY` writes."
+)
 # Pixels are square to better than this part; beyond it, and so many sigmas, the print is in doubt.
 UNEVEN_PART, UNEVEN_SIGMAS = 0.004, 3.0
 # Boards and distances outside of these are rather of other units: inches, centimetres, metres.
@@ -103,18 +108,21 @@ def remarks_on(calibration: Calibration, checks: Checks) -> list[str]:
 
 
 def _print_remarks(calibration: Calibration) -> list[str]:
-    """What the camera says of the board's print: squares that are none, sizes in other units."""
-    camera, remarks = calibration.camera, []
+    """What camera and board say of the print: squares that are none, sizes in other units."""
+    camera, board, remarks = calibration.camera, calibration.board, []
     fx, fy = camera.focal_px
     if camera.covariance is not None:
-        slope = np.array([1 / fx, -1 / fy])
+        slope, stretch = np.array([1 / fx, -1 / fy]), len(BENDS)
         sigma = float(np.sqrt(slope @ camera.covariance[:2, :2] @ slope))
-        apart = float(np.log(fx / fy))
-        if abs(apart) > max(UNEVEN_PART, UNEVEN_SIGMAS * sigma):
-            remarks.append(
-                f"fx and fy differ by {abs(apart):.1%}, and the pixels of nearly all sensors are square: are the squares of the board? "
-                "Measure its scale along x and along y, and give the file that `dishmap sheet ... --measured-mm XxY` writes."
-            )
+        found = [(f"fx and fy differ by {{}}, {SQUARE_PIXELS}", float(np.log(fx / fy)), sigma)]
+        if board.free:
+            sides = 2 * board.shape_mm[stretch] / board.half_mm, 2 * float(np.sqrt(board.covariance_mm2[stretch, stretch])) / board.half_mm
+            found.append(("The board's squares seem to be {} from square", *sides))
+        remarks += [
+            f"{said}: ".format(f"{abs(apart):.1%}") + MEASURE_PRINT
+            for said, apart, sigma in found
+            if abs(apart) > max(UNEVEN_PART, UNEVEN_SIGMAS * sigma)
+        ]
     long, short = board_size_mm(calibration)
     near, far = board_distances_mm(calibration)
     if not (LIKELY_BOARD_MM[0] <= long <= LIKELY_BOARD_MM[1] and LIKELY_DISTANCE_MM[0] <= near and far <= LIKELY_DISTANCE_MM[1]):

@@ -20,6 +20,7 @@ from cli_words import dishmap, map_words, refused
 
 from dishmap.camera.calibrate import LENSES
 from dishmap.camera.model import Camera
+from dishmap.camera.problem import READOUTS
 from dishmap.cli import calibrate as calibrate_words
 from dishmap.cli import demo, pattern
 from dishmap.io.camera_file import read_camera, read_views, write_camera
@@ -73,6 +74,7 @@ def test_words_are_those_of_the_functions() -> None:
     assert set(pattern.KINDS) == set(KIND_BUILDERS)
     assert list(pattern.SURFACES) == list(SURFACE_NAMES)
     assert set(calibrate_words.LENSES.values()) == set(LENSES)
+    assert calibrate_words.READOUTS == READOUTS
 
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
