@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 FIRST_DAMPING, MOST_DAMPING = 1e-3, 1e12
 # From a start near the minimum full steps are tried at once, and 0.01 sigma of it is near enough.
-NEAR_DAMPING, NEAR_GAIN = 1e-10, 1e-9
+NEAR_DAMPING, NEAR_GAIN = 1e-10, 1e-8
 MOST_STEPS = 100
 # A step that is expected to lower the sum of squares by less than this part of it changes no parameter by 1e-5 sigma.
 RELATIVE_GAIN = 1e-12

@@ -8,6 +8,7 @@ read line by line while the board moved shows in the residuals: a motion in each
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -107,13 +108,21 @@ def _tried(
     made: dict[str, Calibration] = {}
     problems: dict[str, MeasurementError | CameraError] = {}
     errors: dict[str, Array] = {}
-    for done, lens in enumerate(CANDIDATES, start=1):
+
+    def tried(lens: str) -> tuple[Calibration, Array] | MeasurementError | CameraError:
         try:
-            made[lens] = calibrate(views, width_px, height_px, lens, flat, readout)
-            errors[lens] = held_out_errors(made[lens], [view.name for view in views])
+            calibration = calibrate(views, width_px, height_px, lens, flat, readout)
+            return calibration, held_out_errors(calibration, [view.name for view in views])
         except (MeasurementError, CameraError) as error:
-            problems[lens] = error
-        tell(done)
+            return error
+
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        for done, (lens, result) in enumerate(zip(CANDIDATES, pool.map(tried, CANDIDATES), strict=True), start=1):
+            if isinstance(result, tuple):
+                made[lens], errors[lens] = result
+            else:
+                problems[lens] = result
+            tell(done)
     if not errors:
         raise problems[CANDIDATES[0]]
     lens, reason = _chosen(errors)

@@ -8,6 +8,7 @@ and Miller 2008). Each refit is a full one, so that it also sees what a linear p
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -70,14 +71,18 @@ def resample(
     covered = covered_area(picture_grid(camera.width_px, camera.height_px), seen)
     square = np.zeros(covered.shape)
     count = np.zeros(covered.shape)
-    for done in range(1, samples + 1):
-        drawn = refit(calibration, rng)
-        length = camera_difference(camera, drawn, distance, seen).length_px
-        good = np.isfinite(length)
-        square[good] += length[good] ** 2
-        count += good
-        if progress:
-            progress(done, samples)
+
+    def apart(own: np.random.Generator) -> Array:
+        return camera_difference(camera, refit(calibration, own), distance, seen).length_px
+
+    # a generator for each refit, so that the answer is the same in whatever order they end
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        for done, length in enumerate(pool.map(apart, rng.spawn(samples)), start=1):
+            good = np.isfinite(length)
+            square[good] += length[good] ** 2
+            count += good
+            if progress:
+                progress(done, samples)
     predicted = projection_error(camera, GRID, distance_mm=distance, covered=covered)
     sampled = np.sqrt(np.where(count > 0.5 * samples, square / np.maximum(count, 1), np.nan))
     return Resampled(predicted.pixels, predicted.sigma_px, sampled, covered, distance, samples)
