@@ -223,18 +223,25 @@ def _eliminated(before: TargetPoses, after: TargetPoses, between: Array, turned:
     """Information (N, 6, 6) and score (N, 6) of the change, the reference's own pose and the ink's spread eliminated.
 
     With e the error of the reference estimate (pose and edge offset) and y = x - between that of the change, the photographs say
-    -e A e / 2 - (e + y) B (e + y) / 2 + p (e + y), A and B their informations (A with its priors, at whose balance e = 0) and p the
-    pull of the current one. Over the best e this is -y (B - B M B) y / 2 + (p - B M p) y, M = (A + B)^-1.
+    q e - e A e / 2 - (e + y) B (e + y) / 2 + p (e + y), A and B their informations (A with its priors), q and p their pulls: q is 0 where
+    the reference is at its balance. Over the best e this is -y (B - B M B) y / 2 + (p - B M (p + q)) y, M = (A + B)^-1.
     """
     held = np.eye(7) * (before.prior[:, :, None] + LEAST_PRIOR)
     a = turned @ (before.information + held) @ turned.T
     b = after.information
     b_m = b @ np.linalg.inv(a + b)
     information = b - b_m @ b
-    score = after.pull - np.einsum("nij,nj->ni", b_m, after.pull)
+    own = _unbalanced(before) @ turned.T
+    score = after.pull - np.einsum("nij,nj->ni", b_m, after.pull + own)
     # edge offsets do not change between the photographs, so the last part of y is known
     offset = -between[:, 6]
     change = information[:, :6, :6]
     score = score[:, :6] - information[:, :6, 6] * offset[:, None]
     change = 0.5 * (change + np.swapaxes(change, 1, 2))
     return change, score + np.einsum("nij,nj->ni", change, between[:, :6])
+
+
+def _unbalanced(poses: TargetPoses) -> Array:
+    """What still pulls (N, 7) at the estimates: nothing where a target's own priors hold it against its pixels, the pixels themselves
+    where its estimate came from all targets together (a grid's)."""
+    return np.where((poses.prior > 0).any(axis=1, keepdims=True), 0.0, poses.pull)

@@ -20,8 +20,8 @@ from dishmap.transforms import Pose
 
 Array = NDArray[Any]
 
-# Turns that nothing shows (about a ring's own axis) are held by this, so weakly that it changes nothing else.
-FREE_TURN_RAD = 10.0
+# Turns and moves that nothing shows (about a ring's own axis; the depth of a crossing) are held by these, so weakly that nothing else changes.
+FREE_TURN_RAD, FREE_MOVE_MM = 10.0, 1e4
 # Edge information against which that counts, per px of edge: what an ordinary photograph gives (0.05 px per pixel of edge).
 EDGE_INFORMATION = 400.0
 
@@ -45,7 +45,10 @@ def pose_response(camera: Camera, pattern: Pattern, index: NDArray[np.int64], ca
 
 def _response(camera: Camera, pattern: Pattern, poses: Poses, index: NDArray[np.int64]) -> tuple[Array, Array]:
     kind, curvature = pattern.kind_of(int(index[0])), pattern.curvature_per_mm[index]
-    xy, _ = outline_samples(kind)
+    if pattern.is_grid:
+        xy = kind.polygons[0].corners_mm if not pattern.lines else np.zeros((1, 2))
+    else:
+        xy, _ = outline_samples(kind)
     pixels, motion = project_printed(camera, poses, curvature, xy)
     points = poses.in_camera(bent_print_mm(np.broadcast_to(xy, (len(poses), *xy.shape)), curvature))
     _, by_point, by_camera = camera.project_with_jacobians(points)
@@ -54,15 +57,20 @@ def _response(camera: Camera, pattern: Pattern, poses: Poses, index: NDArray[np.
     zero = np.zeros_like(x)
     stretch = np.stack([np.stack([x, zero, zero], -1), np.stack([zero, y, zero], -1), np.stack([y, x, zero], -1)], axis=-1)
     strained = by_point @ (poses.rotation[:, None] @ stretch)
-    normals, length = edge_normals(pixels, kind)
-    columns = np.einsum("tqk,tqkp->tqp", normals, motion)
-    weighted = np.swapaxes(columns * (EDGE_INFORMATION * length)[..., None], 1, 2)
+    if pattern.is_grid:
+        # corners and crossings show both of their coordinates
+        seen, weight = np.broadcast_to(np.eye(2), (*pixels.shape[:2], 2, 2)), np.ones(pixels.shape[:2])
+    else:
+        normals, weight = edge_normals(pixels, kind)
+        seen = normals[:, :, None]
+    columns = (seen @ motion).reshape(len(poses), -1, 6)
+    weighted = np.swapaxes((columns.reshape(*seen.shape[:3], 6) * (EDGE_INFORMATION * weight)[..., None, None]).reshape(columns.shape), 1, 2)
     information = weighted @ columns
-    information[:, range(3, 6), range(3, 6)] += FREE_TURN_RAD**-2
+    information[:, range(6), range(6)] += [*(FREE_MOVE_MM**-2,) * 3, *(FREE_TURN_RAD**-2,) * 3]
     turn = np.zeros((len(poses), 6, 6))
     turn[:, :3, :3], turn[:, 3:, 3:] = poses.steps, np.eye(3)
 
     def follow(effect: Array) -> Array:
-        return turn @ np.linalg.solve(information, weighted @ np.einsum("tqk,tqkc->tqc", normals, effect))
+        return turn @ np.linalg.solve(information, weighted @ (seen @ effect).reshape(len(poses), columns.shape[1], -1))
 
     return -follow(by_camera), follow(strained)
