@@ -31,8 +31,8 @@ Index = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 START_SMOOTH, START_CUT, START_BEND, START_ROUNDS = 1e-3, 7.0, 0.05, 5
-SETTLED, LEAST_PART, LEARNT = 0.1, 1e-3, 0.05
-LARGEST_CHANGE, FEWEST_FREE = 10.0, 0.02
+SETTLED, LEAST_PART, LEARNT = 0.1, 1e-3, 0.15
+LARGEST_CHANGE, FEWEST_FREE, RELAXATION = 10.0, 0.02, 1.4
 LOOSE_SIZES, FIRST_SIZES = Sizes(0.1, 1e-2, 1e-4, 0.1), Sizes(0.01, 1e-3, 1e-4, 0.02)
 # Less than any photograph shows, and what rounding allows; a film that stretched smoothly by more than the largest would not stay smooth.
 LEAST_SIZES, LARGEST_SIZES = Sizes(1e-5, 1e-5, 1e-7, 1e-5), Sizes(10.0, 0.1, 1e-3, 1e3)
@@ -126,7 +126,7 @@ def learn(terms: Terms, tell: Callable[[int, int], None]) -> tuple[State, Sizes,
     for number in range(LEARN_ROUNDS):
         used = screened(terms, system, sizes, used)
         before, sizes = sizes, relearnt(terms, state, system, sizes)
-        state, system, _ = descend(terms, state, sizes, used, 2)
+        state, system, _ = descend(terms, state, sizes, used, 1)
         tell(number + 1, LEARN_ROUNDS)
         if np.abs(np.log(sizes.values / before.values)).max() < LEARNT:
             break
@@ -230,15 +230,22 @@ def relearnt(terms: Terms, state: State, system: System, sizes: Sizes) -> Sizes:
     )
     free = np.maximum((spoken - left) / old[1:] ** 2, FEWEST_FREE * spoken / old[1:] ** 2)
     new = np.sqrt(np.append(_print_variance(terms, system, sizes), squares / free))
-    new = np.clip(new, old / LARGEST_CHANGE, old * LARGEST_CHANGE)
+    # each such step goes only part of the way
+    new = np.clip(old * (new / old) ** RELAXATION, old / LARGEST_CHANGE, old * LARGEST_CHANGE)
     return Sizes(*(float(x) for x in np.clip(new, LEAST_SIZES.values, LARGEST_SIZES.values)))
 
 
 def _print_variance(terms: Terms, system: System, sizes: Sizes) -> float:
     """The variance of printing errors after a step of Fisher's scoring (Patterson and Thompson 1971), in mm^2."""
-    weight, rows = system.weight, system.view.by_cell
+    weight, m = system.weight, system.residual.shape[1]
     turned = weight @ system.by_print
-    left = rows @ system.matrix.covariance_of_cells[terms.cell] @ np.swapaxes(rows, 1, 2)
+    # cell by cell, as a copy of its covariance for every target would cost more than the sums
+    padded = np.concatenate([system.view.by_cell, np.zeros((1, m, system.view.by_cell.shape[2]))])[terms.in_cells]
+    half = padded.reshape(len(padded), -1, padded.shape[3]) @ system.matrix.covariance_of_cells
+    own = half.reshape(padded.shape) @ np.swapaxes(padded, 2, 3)
+    left = np.zeros((len(turned) + 1, m, m))
+    left[terms.in_cells] = own
+    left = left[:-1]
     pull = (weight @ system.residual[..., None])[..., 0]
     score = np.einsum("ni,nij,nj->", pull, system.by_print, pull) - np.trace(turned, axis1=1, axis2=2).sum()
     score += np.einsum("nij,njk,nki->", turned, weight, left)

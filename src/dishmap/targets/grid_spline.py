@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from dishmap.targets.grid_blocks import Blocks
 
@@ -109,6 +110,12 @@ class Spline:
         _, _, _, size, blocks = self._homes
         return size * blocks
 
+    @cached_property
+    def _gathering(self) -> csr_array:
+        """The sum over cells of what stands for each unknown (unknowns, cells * 48)."""
+        home = self._homes[0].ravel()
+        return csr_array((np.ones(len(home)), (home, np.arange(len(home)))), shape=(self.unknowns, len(home)))
+
     def assembled(self, cells: Array, ridge: float) -> Blocks:
         """The normal matrix from those of all cells (cells, 48, 48), with `ridge` on its diagonal (1 where no control point is)."""
         _, inside, below, size, blocks = self._homes
@@ -121,9 +128,7 @@ class Spline:
 
     def gathered(self, cells: Array) -> Array:
         """Right-hand sides (unknowns, K) from those of all cells (cells, 48, K)."""
-        unknown = self._homes[0].ravel()
-        columns = [np.bincount(unknown, cells[..., k].ravel(), self.unknowns) for k in range(cells.shape[-1])]
-        return np.stack(columns, axis=-1)
+        return np.asarray(self._gathering @ cells.reshape(-1, cells.shape[-1]))
 
     def of_cells(self, vector: Array) -> Array:
         """What vectors (unknowns, ...) hold for each cell (cells, 48, ...)."""
@@ -133,20 +138,20 @@ class Spline:
         """Control points (shape[0] * shape[1], 3) of a vector (unknowns,)."""
         return np.asarray(vector[: 3 * self.shape[0] * self.shape[1]].reshape(-1, 3))
 
-    def inverse_of_cells(self, inverse: Blocks) -> Array:
-        """Covariances (cells, 48, 48) of the unknowns of each cell from the inverse of a normal matrix."""
-        unknown, _, _, size, _ = self._homes
+    @cached_property
+    def _places(self) -> Index:
+        """Where a cell's 48 x 48 entries lie in a matrix's diagonal blocks and those below, one after the other (cells, 48, 48)."""
+        unknown, _, _, size, blocks = self._homes
         block, place = np.divmod(unknown, size)
         row, column = block[:, :, None], block[:, None, :]
-        i, j = np.broadcast_arrays(place[:, :, None], place[:, None, :])
-        row, column = np.broadcast_arrays(row, column)
-        out = inverse.diagonal[row, i, j]
-        low = np.minimum(row, column)
-        if len(inverse.below):
-            safe = np.minimum(low, len(inverse.below) - 1)
-            out = np.where(row > column, inverse.below[safe, i, j], out)
-            out = np.where(row < column, inverse.below[safe, j, i], out)
-        return np.asarray(out)
+        i, j = place[:, :, None], place[:, None, :]
+        # above the diagonal the block below it is read the other way
+        below = blocks * size * size + np.minimum(row, column) * size * size + np.where(row > column, i * size + j, j * size + i)
+        return np.asarray(np.where(row == column, row * size * size + i * size + j, below))
+
+    def inverse_of_cells(self, inverse: Blocks) -> Array:
+        """Covariances (cells, 48, 48) of the unknowns of each cell from the inverse of a normal matrix."""
+        return np.concatenate([inverse.diagonal.ravel(), inverse.below.ravel()])[self._places]
 
 
 def _basis(t: Array, by: int) -> Array:
