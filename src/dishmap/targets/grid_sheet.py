@@ -32,6 +32,7 @@ Flags = NDArray[np.bool_]
 
 START_SMOOTH, START_CUT, START_BEND, START_ROUNDS = 1e-3, 7.0, 0.05, 5
 SETTLED, LEAST_PART, LEARNT = 0.1, 1e-3, 0.15
+USUAL_STRAIN = 1e-4
 LARGEST_CHANGE, FEWEST_FREE, RELAXATION = 10.0, 0.02, 1.4
 LOOSE_SIZES, FIRST_SIZES = Sizes(0.1, 1e-2, 1e-4, 0.1), Sizes(0.01, 1e-3, 1e-4, 0.02)
 # Less than any photograph shows, and what rounding allows; a film that stretched smoothly by more than the largest would not stay smooth.
@@ -229,6 +230,8 @@ def relearnt(terms: Terms, state: State, system: System, sizes: Sizes) -> Sizes:
         for m in (alone, system.matrix)
     )
     free = np.maximum((spoken - left) / old[1:] ** 2, FEWEST_FREE * spoken / old[1:] ** 2)
+    # few smooth strains show, so that their size needs a prior: half a Cauchy distribution (Gelman 2006)
+    free[1] += 2 * old[2] ** 2 / (old[2] ** 2 + USUAL_STRAIN**2)
     new = np.sqrt(np.append(_print_variance(terms, system, sizes), squares / free))
     # each such step goes only part of the way
     new = np.clip(old * (new / old) ** RELAXATION, old / LARGEST_CHANGE, old * LARGEST_CHANGE)

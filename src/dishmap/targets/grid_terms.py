@@ -10,7 +10,8 @@ from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 
 from dishmap.camera.model import Camera
-from dishmap.targets.grid_spline import CELL, FIRST, REACH, Spline, fit_spline, gauss_points
+from dishmap.targets.grid_blocks import factor
+from dishmap.targets.grid_spline import CELL, FIRST, Spline, gauss_points
 from dishmap.targets.pattern import Pattern
 
 Array = NDArray[np.float64]
@@ -27,7 +28,7 @@ STRAIN_WEIGHT = np.array([1.0, 1.0, np.sqrt(2.0)])
 # Degree of the smooth strains that a sheet may have besides those of single cells.
 STRAIN_DEGREE = 3
 # Fit of the nominal places, which are smooth: rounding is all that is smoothed.
-NOMINAL_SMOOTH = 1e-9
+NOMINAL_SMOOTH, NOMINAL_RIDGE = 1e-6, 1e-10
 
 
 @dataclass(frozen=True)
@@ -134,9 +135,7 @@ def terms_of(camera: Camera, pattern: Pattern, spline: Spline, rows: Index, meas
 def _nominal(pattern: Pattern, spline: Spline, rows: Index) -> Nominal:
     assert pattern.lattice is not None
     lattice = pattern.lattice.astype(float)
-    end = spline.low + spline.knot * np.array(spline.count)
-    near = ((lattice >= spline.low - spline.knot) & (lattice <= end + spline.knot)).all(axis=1)
-    control = fit_spline(spline, lattice[near], pattern.center_mm[near], np.ones(int(near.sum())), NOMINAL_SMOOTH)
+    control = _nominal_control(pattern, spline)
     own = of_cells(spline, control)
     tangent = np.moveaxis(spline.at_gauss[:, None] @ own, 0, -1)
     metric = np.swapaxes(tangent, -1, -2) @ tangent
@@ -148,6 +147,28 @@ def _nominal(pattern: Pattern, spline: Spline, rows: Index) -> Nominal:
     # lattice steps per mm along the target's own axes
     steps = np.linalg.inv(np.swapaxes(at @ pattern.axes[rows][..., :2], 1, 2))
     return Nominal(control, frame, np.einsum("cd,ckd->ck", normal, third @ own), CORNERS @ np.swapaxes(steps, 1, 2))
+
+
+def _nominal_control(pattern: Pattern, spline: Spline) -> Array:
+    """Control points (K, 3) of the nominal surface: through the targets' places, at right angles to their normals."""
+    assert pattern.lattice is not None
+    lattice = pattern.lattice.astype(float)
+    end = spline.low + spline.knot * np.array(spline.count)
+    near = np.flatnonzero(((lattice >= spline.low - spline.knot) & (lattice <= end + spline.knot)).all(axis=1))
+    cell = spline.cell_of(lattice[near])
+    place = by_unknowns(spline.weights(cell, lattice[near], (0, 0)))
+    slopes = np.stack([spline.weights(cell, lattice[near], by) for by in FIRST], axis=1)
+    level = (slopes[..., None] * pattern.normal[near][:, None, None]).reshape(len(near), 2, CELL)
+    rows = np.concatenate([place, level], axis=1)
+    value = np.pad(pattern.center_mm[near], ((0, 0), (0, 2)))
+    cells = np.zeros((spline.cells, CELL, CELL))
+    third = by_unknowns(spline.at_middle[1] * THIRD_WEIGHT[:, None]).reshape(-1, CELL)
+    cells += NOMINAL_SMOOTH * spline.knot**2 * (third.T @ third)
+    right = np.zeros((spline.cells, CELL, 1))
+    np.add.at(cells, cell, np.swapaxes(rows, 1, 2) @ rows)
+    np.add.at(right, cell, np.swapaxes(rows, 1, 2) @ value[..., None])
+    matrix = spline.assembled(cells, NOMINAL_RIDGE)
+    return spline.control_points(factor(matrix).solve(spline.gathered(right))[:, 0])
 
 
 def seen(terms: Terms, control_mm: Array, spread_mm: float) -> Seen:
