@@ -49,6 +49,9 @@ ORDER = [
     # and the nodes of grids
     *("targets.lattice_map", "targets.grid_shapes", "targets.grid_pixels", "targets.grid_fit", "targets.grid_arms", "targets.grid_stages"),
     *("targets.grid_outcome", "targets.grid_points"),
+    # and the surface through all of them
+    *("targets.grid_blocks", "targets.grid_spline", "targets.grid_terms", "targets.grid_system"),
+    *("targets.grid_start", "targets.grid_learn", "targets.grid_sheet", "targets.grid_poses"),
     # boards of circles
     *("camera.board_labels", "camera.circle_board"),
     # measuring it as the paper does, and the limit of both

@@ -14,6 +14,9 @@ from dishmap.errors import FitError, InputError, MeasurementError
 from dishmap.surface.cloud import PointCloud, transform_cloud
 from dishmap.surface.fit import Basis, SurfaceFit, fit_surface, flag_off_surface
 from dishmap.targets.detect import Detections, find_ellipses
+from dishmap.targets.grid_detect import GridDetections, find_grid
+from dishmap.targets.grid_identify import GridIdentity, identify_grid
+from dishmap.targets.grid_poses import measure_grid_targets
 from dishmap.targets.identify import Hint, Identity, identify
 from dishmap.targets.paper import PaperPoses, paper_poses
 from dishmap.targets.pattern import Pattern
@@ -43,8 +46,8 @@ class Map:
     surface_problem: str
     rejected: tuple[tuple[int | None, str], ...]
     missing: tuple[int, ...]
-    detections: Detections
-    identity: Identity
+    detections: Detections | GridDetections
+    identity: Identity | GridIdentity
     poses: TargetPoses | PaperPoses
 
 
@@ -69,16 +72,14 @@ def map_photograph(
     check_image(image, camera)
     if method == "paper":
         image, camera = undistort_image(camera, image)
-    detections = find_ellipses(image)
-    identity = identify(detections, pattern, camera, hint)
-    poses: TargetPoses | PaperPoses
-    if method == "paper":
-        poses = paper_poses(image, camera, pattern, detections, identity.mark, identity.detection)
+    detections, identity, poses = (_of_grid if pattern.is_grid else _of_circles)(
+        image, camera, pattern, hint, method, assumptions, progress
+    )
+    if isinstance(poses, PaperPoses):
         if not len(poses):
             raise MeasurementError("the paper's method could measure none of the named targets; try --method pose")
         cloud, camera_from_dish = _paper_cloud(poses), identity.camera_from_dish
     else:
-        poses = measure_targets(image, camera, pattern, detections, identity, assumptions, progress)
         if not len(poses):
             raise MeasurementError("every named target was rejected: " + "; ".join(sorted({reason for _, reason in poses.rejected})))
         cloud, camera_from_dish = cloud_of(poses), poses.camera_from_dish
@@ -89,6 +90,41 @@ def map_photograph(
     rejected = (*poses.rejected, *((None, r.reason) for r in identity.rejected))
     missing = tuple(int(i) for i in pattern.ids if int(i) not in seen)
     return Map(method, camera, pattern, cloud, camera_from_dish, fitted, problem, rejected, missing, detections, identity, poses)
+
+
+def _of_circles(
+    image: NDArray[np.generic],
+    camera: Camera,
+    pattern: Pattern,
+    hint: Hint,
+    method: str,
+    assumptions: Assumptions | None,
+    progress: Callable[[int, int], None] | None,
+) -> tuple[Detections, Identity, TargetPoses | PaperPoses]:
+    detections = find_ellipses(image)
+    identity = identify(detections, pattern, camera, hint)
+    if method == "paper":
+        return detections, identity, paper_poses(image, camera, pattern, detections, identity.mark, identity.detection)
+    return detections, identity, measure_targets(image, camera, pattern, detections, identity, assumptions, progress)
+
+
+def _of_grid(
+    image: NDArray[np.generic],
+    camera: Camera,
+    pattern: Pattern,
+    hint: Hint,
+    method: str,
+    assumptions: Assumptions | None,
+    progress: Callable[[int, int], None] | None,
+) -> tuple[GridDetections, GridIdentity, TargetPoses | PaperPoses]:
+    if assumptions is not None and assumptions != Assumptions():
+        raise InputError("assumptions on ink and normals belong to targets made of circles; a grid learns them: leave them out")
+    detections = find_grid(image, bool(pattern.lines))
+    identity = identify_grid(detections, pattern, camera, hint)
+    if method == "paper":
+        places = detections.place_px[identity.detection]
+        raise InputError("later")
+    return detections, identity, measure_grid_targets(image, camera, pattern, detections, identity, progress)
 
 
 def cloud_of(poses: TargetPoses) -> PointCloud:

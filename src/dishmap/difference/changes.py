@@ -242,6 +242,8 @@ def _eliminated(before: TargetPoses, after: TargetPoses, between: Array, turned:
 
 
 def _unbalanced(poses: TargetPoses) -> Array:
-    """What still pulls (N, 7) at the estimates: nothing where a target's own priors hold it against its pixels, the pixels themselves
-    where its estimate came from all targets together (a grid's)."""
+    """What still pulls (N, 7) at the estimates.
+
+    Nothing where a target's own priors hold it against its pixels; the pixels where its estimate came from all targets together (a grid's).
+    """
     return np.where((poses.prior > 0).any(axis=1, keepdims=True), 0.0, poses.pull)

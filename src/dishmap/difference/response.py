@@ -20,7 +20,8 @@ from dishmap.transforms import Pose
 
 Array = NDArray[Any]
 
-# Turns and moves that nothing shows (about a ring's own axis; the depth of a crossing) are held by these, so weakly that nothing else changes.
+# Turns and moves that nothing shows (about a ring's own axis; the depth of a crossing) are held by these, so weakly that nothing else
+# changes.
 FREE_TURN_RAD, FREE_MOVE_MM = 10.0, 1e4
 # Edge information against which that counts, per px of edge: what an ordinary photograph gives (0.05 px per pixel of edge).
 EDGE_INFORMATION = 400.0
@@ -64,7 +65,9 @@ def _response(camera: Camera, pattern: Pattern, poses: Poses, index: NDArray[np.
         normals, weight = edge_normals(pixels, kind)
         seen = normals[:, :, None]
     columns = (seen @ motion).reshape(len(poses), -1, 6)
-    weighted = np.swapaxes((columns.reshape(*seen.shape[:3], 6) * (EDGE_INFORMATION * weight)[..., None, None]).reshape(columns.shape), 1, 2)
+    weighted = np.swapaxes(
+        (columns.reshape(*seen.shape[:3], 6) * (EDGE_INFORMATION * weight)[..., None, None]).reshape(columns.shape), 1, 2
+    )
     information = weighted @ columns
     information[:, range(6), range(6)] += [*(FREE_MOVE_MM**-2,) * 3, *(FREE_TURN_RAD**-2,) * 3]
     turn = np.zeros((len(poses), 6, 6))

@@ -11,8 +11,8 @@ from threadpoolctl import threadpool_limits
 
 from dishmap.camera.model import Camera
 from dishmap.quality import Quality
-from dishmap.targets.grid_identify import GridIdentity
 from dishmap.targets.grid_detect import GridDetections
+from dishmap.targets.grid_identify import GridIdentity
 from dishmap.targets.grid_points import GridPoints, measure_grid
 from dishmap.targets.grid_sheet import Sheet, estimate_sheet, target_axes
 from dishmap.targets.pattern import Pattern

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from scipy.sparse import csr_array
 
 from dishmap.targets.grid_blocks import Blocks
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 Index = NDArray[np.int64]
 
 # Rows: control points of a cell; columns: powers of the place in the cell, 0 to 1 (de Boor, A Practical Guide to Splines, X).
@@ -32,7 +33,7 @@ FIRST, SECOND, THIRD = ((1, 0), (0, 1)), ((2, 0), (1, 1), (0, 2)), ((3, 0), (2, 
 
 @dataclass(frozen=True)
 class Spline:
-    """The layout of a tensor spline: its first cell begins at `low` (2,) in lattice coordinates, cells are `knot` wide, count (2,) of them."""
+    """The layout of a tensor spline: `count` cells along both directions, `knot` lattice steps wide, the first from `low` (2,) on."""
 
     low: Array
     knot: float

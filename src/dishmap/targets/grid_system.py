@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from dishmap.targets.grid_blocks import Factor, factor
 from dishmap.targets.grid_spline import Spline
 from dishmap.targets.grid_terms import Seen, Terms, rough_rows, seen, strain_rows
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 Index = NDArray[np.int64]
 
 # A square's edges may lie outwards by this part of half its side: the pitch measures the side, so it may be poorly known.
@@ -116,8 +117,11 @@ class Bordered:
 
 @dataclass(frozen=True)
 class System:
-    """Normal equations at a state: matrix; right (unknowns,), right_shared (B,): gradients; cost; and what they were made of: view,
-    residual (N, m), weight (N, m, m), by_print (N, m, m): covariance of 1 mm of printing error; strain, rough: rows of the priors."""
+    """Normal equations at a state.
+
+    matrix; right (unknowns,), right_shared (B,): gradients; cost; and what they were made of: view, residual (N, m), weight (N, m, m),
+    by_print (N, m, m): covariance of 1 mm of printing error; strain, rough: rows of the priors.
+    """
 
     matrix: Bordered
     right: Array
@@ -148,8 +152,8 @@ def shared_precision(terms: Terms, sizes: Sizes) -> Array:
     return np.append(strains, (SPREAD_PART * float(np.median(terms.half_mm))) ** -2) if terms.squares else strains
 
 
-def system_at(terms: Terms, state: State, sizes: Sizes, used: Array) -> System:
-    """The normal equations at a state; used (N,): 1 for targets that count, 0 for others. Raises numpy.linalg.LinAlgError."""
+def system_at(terms: Terms, state: State, sizes: Sizes, used: NDArray[np.bool_]) -> System:
+    """The normal equations at a state; used (N,): which targets count. Raises numpy.linalg.LinAlgError."""
     view = seen(terms, state.control_mm, state.spread_mm(terms))
     residual = terms.measured - view.value
     by_print = _by_print(view)
@@ -194,9 +198,9 @@ def _normal(rows: Rows, size: float) -> tuple[Array, Array | float, Array | floa
     return turned @ rows.by_cell, turned @ rows.by_shared, flat.T @ flat / size**2
 
 
-def _bordered(spline: Spline, cells: Array, border: Array, corner: Array, ridge: float) -> Bordered:
+def _bordered(spline: Spline, cells: Array, border: Array | float, corner: Array, ridge: float) -> Bordered:
     ridge = max(ridge, ROUNDING * float(np.trace(cells, axis1=1, axis2=2).max()))
-    return Bordered(spline, factor(spline.assembled(cells, ridge)), spline.gathered(border), corner)
+    return Bordered(spline, factor(spline.assembled(cells, ridge)), spline.gathered(np.asarray(border)), corner)
 
 
 def _by_print(view: Seen) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
@@ -14,7 +15,7 @@ from dishmap.targets.grid_blocks import factor
 from dishmap.targets.grid_spline import CELL, FIRST, Spline, gauss_points
 from dishmap.targets.pattern import Pattern
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 Index = NDArray[np.int64]
 
 # Corners of a square in units of its half sides, counter-clockwise from the upper right, and how what is measured of it (middle,
@@ -96,8 +97,11 @@ class Terms:
 
 @dataclass(frozen=True)
 class Seen:
-    """The photograph as a sheet predicts it: value (N, m); by_cell (N, m, 48), by_spread (N, m): its derivatives; by_move (N, 2, 2): of the
-    target's middle by moves along both tangents, px/mm, each along its lattice direction."""
+    """The photograph as a sheet predicts it.
+
+    value (N, m), px; by_cell (N, m, 48), by_spread (N, m): its derivatives; by_move (N, 2, 2): those of the target's middle by moves along
+    both lattice directions, px/mm.
+    """
 
     value: Array
     by_cell: Array
@@ -211,7 +215,7 @@ def seen_by_camera(terms: Terms, control_mm: Array, spread_mm: float) -> Array:
 
 
 def strain_rows(terms: Terms, control_mm: Array) -> tuple[Array, Array]:
-    """Strain (cells, 12) of all cells at Gauss's points, three components each, weighted to count a lattice cell once, and d / d unknowns."""
+    """Strain (cells, 12) of all cells, three components at each of Gauss's points, counting a lattice cell once, and d / d unknowns."""
     spline, frame = terms.spline, terms.nominal.frame
     own = of_cells(spline, control_mm)
     tangent = np.moveaxis(spline.at_gauss[:, None] @ own, 0, -1) @ frame
