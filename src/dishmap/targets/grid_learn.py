@@ -19,7 +19,7 @@ Flags = NDArray[np.bool_]
 # What the rest of the way may lower chi-square by, the smallest part of a step that is tried, and the change of a size's logarithm at which
 # learning ends.
 SETTLED, LEAST_PART, LEARNT = 0.1, 1e-3, 0.15
-# Width of the prior on smooth strains. A size changes by no more than this factor at a time. A step of learning goes only part of the way, and
+# Width of the prior on smooth strains; most that a size changes by at a time. A step of learning goes only part of the way, so it
 # is made so much longer.
 USUAL_STRAIN, LARGEST_CHANGE, RELAXATION = 1e-4, 10.0, 1.4
 # Least part of what a prior speaks of that is taken to be seen.
