@@ -8,6 +8,7 @@ neither photograph shows, ink that ran) cancels in the change.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -28,8 +29,11 @@ LEAST_TARGETS = 3
 ALIGN_STEPS = 30
 # Weights of the first alignment fall beyond this many median distances.
 ALIGN_CUT = 4.0
-# Added to information so that matrices of what nothing shows (the turn of a lone ring) stay regular: a sigma of 10^6 mm or rad.
-LEAST_PRIOR = 1e-12
+# Added to information so that matrices of what nothing shows (the turn of a lone ring, the depth of a lone crossing) stay regular: a sigma
+# of 10^6 mm or rad, and no less than rounding allows beside what the pixels show best.
+LEAST_PRIOR, LEAST_SHARE = 1e-12, 1e-10
+# A direction counts as seen when its information, in units of those of the six, exceeds this.
+LEAST_SEEN = 1e-7
 
 
 @dataclass(frozen=True)
@@ -60,6 +64,13 @@ class TargetChanges:
     def __len__(self) -> int:
         return len(self.ids)
 
+    @cached_property
+    def directions(self) -> Index:
+        """How many of a target's six directions the photographs show (N,): all of a group of rings, 2 of a crossing of lines."""
+        scale = np.sqrt(np.diagonal(self.information, axis1=1, axis2=2))
+        even = self.information / np.maximum(scale[:, :, None] * scale[:, None, :], LEAST_PRIOR)
+        return np.asarray((np.linalg.eigvalsh(even) > LEAST_SEEN).sum(axis=1))
+
 
 def combine_frames(frames: list[TargetPoses]) -> TargetPoses:
     """One measurement from several photographs of the same state by the same fixed camera.
@@ -83,7 +94,7 @@ def _merged(a: TargetPoses, b: TargetPoses) -> TargetPoses:
     information = a.information.copy()
     information[in_a] += b.information[in_b]
     # the new estimate, with a's priors in force: they pull against a.pull
-    posterior = information[in_a] + a.prior[in_a][:, :, None] * np.eye(7) + LEAST_PRIOR * np.eye(7)
+    posterior = information[in_a] + _held(a.prior[in_a], information[in_a])
     step = np.linalg.solve(posterior, pull_b[..., None])[..., 0]
     pull = a.pull.copy()
     pull[in_a] += pull_b - np.einsum("nij,nj->ni", information[in_a], step)
@@ -214,7 +225,7 @@ def target_changes(reference: TargetPoses, current: TargetPoses, camera: Camera,
 
 def changed_information(before: Array, after: Array, prior: Array) -> Array:
     """Information (N, 6, 6) on the change from those of two photographs (N, 7, 7) and the priors (N, 7) of the reference."""
-    a = before + np.eye(7) * (prior[:, :, None] + LEAST_PRIOR)
+    a = before + _held(prior, before)
     change = after - after @ np.linalg.inv(a + after) @ after
     return np.asarray(0.5 * (change + np.swapaxes(change, 1, 2)))[:, :6, :6]
 
@@ -226,8 +237,7 @@ def _eliminated(before: TargetPoses, after: TargetPoses, between: Array, turned:
     q e - e A e / 2 - (e + y) B (e + y) / 2 + p (e + y), A and B their informations (A with its priors), q and p their pulls: q is 0 where
     the reference is at its balance. Over the best e this is -y (B - B M B) y / 2 + (p - B M (p + q)) y, M = (A + B)^-1.
     """
-    held = np.eye(7) * (before.prior[:, :, None] + LEAST_PRIOR)
-    a = turned @ (before.information + held) @ turned.T
+    a = turned @ (before.information + _held(before.prior, before.information)) @ turned.T
     b = after.information
     b_m = b @ np.linalg.inv(a + b)
     information = b - b_m @ b
@@ -247,3 +257,9 @@ def _unbalanced(poses: TargetPoses) -> Array:
     Nothing where a target's own priors hold it against its pixels; the pixels where its estimate came from all targets together (a grid's).
     """
     return np.where((poses.prior > 0).any(axis=1, keepdims=True), 0.0, poses.pull)
+
+
+def _held(prior: Array, information: Array) -> Array:
+    """Precision (N, 7, 7) of the priors (N, 7), and as much as keeps the sum with `information` (N, 7, 7) regular."""
+    least = LEAST_PRIOR + LEAST_SHARE * np.diagonal(information, axis1=1, axis2=2).max(axis=1)
+    return np.eye(7) * (prior + least[:, None])[:, :, None]

@@ -33,8 +33,6 @@ SIGNIFICANCE = 0.01
 # Broadest modes of the field in which significance is looked for, and the least information on one, relative to the best seen.
 TESTED_MODES, LEAST_SEEN = 20, 1e-9
 EXPANSION, FOCAL, NORMAL = (BLOCKS.index(name) for name in ("expansion", "focal", "normal"))
-# A target's change has three moves and three turns.
-DIRECTIONS = 6
 
 
 @dataclass(frozen=True)
@@ -320,7 +318,7 @@ def _assembled(
         sigma_depth_change_mm=np.sqrt(variance[deep]),
         sigma_shape_mm=np.sqrt(variance[shape]),
         du_dv_px=changes.du_dv_px,
-        misfit=np.sqrt(estimate.misfit / DIRECTIONS),
+        misfit=np.sqrt(np.maximum(estimate.misfit, 0.0) / np.maximum(changes.directions, 1)),
         quality=changes.quality
         | np.where(estimate.kept > 0, 0, int(Quality.OUTLIER))
         | np.where(estimate.loose, int(Quality.OFF_SURFACE), 0),

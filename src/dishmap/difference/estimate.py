@@ -35,6 +35,8 @@ PASSES = 3
 # Screening: sizes wide enough for any surface, and how much worse than most targets (this quantile) one may fit, in chi-square; first
 # coarsely, then under the best hypothesis. Six degrees of freedom have chi-square 7.8 at that quantile, 39 once in a million.
 SCREEN = Sizes(normal_mm=1.0, slide_strain=1e-3, rough_mm=1.0, print_strain=1e-3)
+# Directions of a target of which no more than its place in the photograph is seen: the crossing of two lines.
+PLACE_ONLY = 2
 SCREEN_ROUNDS, SCREEN_STEP, SCREEN_RATIO, FIT_RATIO = 20, 4.0, 30.0, 5.0
 LIKE_MOST, USUAL_MISFIT = 0.75, 7.8
 # The search for the size of the displacement starts at what the screening saw, within these.
@@ -272,7 +274,7 @@ class _Problem:
     def enlarge(self, best: Hypothesis) -> bool:
         """Scale the noise to the residuals where they are larger than claimed; True when that changed anything."""
         evidence = self.evidence(best.columns, best.posterior)
-        freedom = 6 * self.kept.sum() - determined(evidence, best.posterior)
+        freedom = float(self.changes.directions @ self.kept) - determined(evidence, best.posterior)
         if freedom < LEAST_FREEDOM:
             return False
         factor = float((misfit(evidence, best.posterior) * self.kept).sum()) / freedom
@@ -294,8 +296,8 @@ class _Problem:
             return ("normal",)
         if self.priors.slide is not None:
             return (self.priors.slide,)
-        if self.priors.strain == "free":
-            # without the size of prints nothing tells how points slide: they do what a membrane does
+        if self.priors.strain == "free" or self.changes.directions.max() <= PLACE_ONLY:
+            # where prints do not show their own size, nothing tells how points slide: they do what a membrane does
             return ("least_strain",)
         # on a plane the slide does not depend on the displacement along the normal
         return tuple(WAYS) if self.pattern.surface.kind == "paraboloid" else ("normal", "any")
