@@ -117,6 +117,7 @@ def blank_changes(camera: Camera, pattern: Pattern, index: NDArray[np.int64], ca
         by_focal=-by_camera[..., :2] @ camera.parameters[:2],
         by_calibration=np.zeros_like(by_camera),
         moved=Pose.identity(),
+        position_mm=camera_from_dish.apply(pattern.center_mm[index]),
         du_dv_px=np.zeros((count, 2)),
         covariance_du_dv_px2=np.zeros((count, 2, 2)),
         quality=np.zeros(count, np.int64),

@@ -44,7 +44,8 @@ class TargetChanges:
     change x = (move along camera axes in mm, turn about target axes in rad) is score . x - x . information x / 2 with
     information (N, 6, 6) and score (N, 6). by_strain (N, 6, 3): change that a strain xx, yy, xy of the print looks like; by_focal
     (N, 6): the same for a focal length that grew, per unit; by_calibration (N, 6, P): what is left of the calibration's error in a
-    difference. moved: camera_from_camera rigid motion, reference to current; du_dv_px (N, 2): motion of the centre in the image;
+    difference. moved: camera_from_camera rigid motion, reference to current; position_mm (N, 3): the reference's, moved, where the
+    likelihood of targets of which only their places are seen is linear; du_dv_px (N, 2): motion of the centre in the image;
     covariance_du_dv_px2 (N, 2, 2); quality (N,): bits of either photograph.
     """
 
@@ -57,6 +58,7 @@ class TargetChanges:
     by_focal: Array
     by_calibration: Array
     moved: Pose
+    position_mm: Array
     du_dv_px: Array
     covariance_du_dv_px2: Array
     quality: Index
@@ -203,6 +205,7 @@ def target_changes(reference: TargetPoses, current: TargetPoses, camera: Camera,
     aligned = replace(before, position_mm=moved.apply(before.position_mm), rotation=moved.rotation @ before.rotation)
     turned = np.zeros((7, 7))
     turned[:3, :3], turned[3:, 3:] = moved.rotation, np.eye(4)
+    after = _seen_from(aligned, after, camera)
     information, score = _eliminated(before, after, _between(aligned, after), turned)
     camera_before, _ = pose_response(camera, pattern, before.index, reference.camera_from_dish)
     camera_after, strain = pose_response(camera, pattern, before.index, moved @ reference.camera_from_dish)
@@ -217,10 +220,39 @@ def target_changes(reference: TargetPoses, current: TargetPoses, camera: Camera,
         by_focal=focal,
         by_calibration=camera_after - turned[:6, :6] @ camera_before,
         moved=moved,
+        position_mm=aligned.position_mm,
         du_dv_px=after.center_px - before.center_px,
         covariance_du_dv_px2=before.covariance_px2 + after.covariance_px2,
         quality=before.quality | after.quality,
     )
+
+
+def shows_place_only(information: Array) -> NDArray[np.bool_]:
+    """Where (N,) pixels say nothing of turns and ink (N, 7, 7): the crossings of lines."""
+    return np.asarray(~information[:, 3:, 3:].any(axis=(1, 2)))
+
+
+def _seen_from(aligned: TargetPoses, after: TargetPoses, camera: Camera) -> TargetPoses:
+    """The current state with the likelihood of crossings taken at the reference's places, moved, instead of at its own.
+
+    A crossing's own depth comes from all others, and where the surface has stretched it is off by more than a linear likelihood bears.
+    """
+    rows = np.flatnonzero(shows_place_only(after.information))
+    if not len(rows):
+        return after
+    seen, by_point = camera.project_with_point_jacobian(after.position_mm[rows])
+    back = np.swapaxes(by_point, 1, 2) @ np.linalg.inv(by_point @ np.swapaxes(by_point, 1, 2))
+    weight = np.swapaxes(back, 1, 2) @ after.information[rows, :3, :3] @ back
+    pulled = np.einsum("nji,nj->ni", back, after.pull[rows, :3])
+    measured = seen + np.linalg.solve(weight, pulled[..., None])[..., 0]
+    there, by_point = camera.project_with_point_jacobian(aligned.position_mm[rows])
+    turned = np.swapaxes(by_point, 1, 2) @ weight
+    information, pull = after.information.copy(), after.pull.copy()
+    information[rows, :3, :3] = turned @ by_point
+    pull[rows, :3] = (turned @ (measured - there)[..., None])[..., 0]
+    position, rotation = after.position_mm.copy(), after.rotation.copy()
+    position[rows], rotation[rows] = aligned.position_mm[rows], aligned.rotation[rows]
+    return replace(after, information=information, pull=pull, position_mm=position, rotation=rotation)
 
 
 def changed_information(before: Array, after: Array, prior: Array) -> Array:

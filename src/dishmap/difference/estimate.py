@@ -120,6 +120,7 @@ class _Problem:
         self.kept = np.ones(len(changes))
         self.loose = np.zeros(len(changes), bool)
         self.scale = 1.0
+        self.place_only = np.flatnonzero(changes.directions <= PLACE_ONLY)
         self.hub = self._hub()
         # one for each length, the same for all ways
         self.kernels: dict[float, Kernel] = {}
@@ -141,10 +142,22 @@ class _Problem:
         constant = 0.0
         if at is not None:
             curved = curved_change(columns, self.pattern, self.changes.index, self.to_camera, self.changes.by_strain, at.mean)
+            curved[:, :3] += self.perspective((columns.move @ at.mean) @ self.to_camera.T)
             shift = np.einsum("nij,nj->ni", information, curved)
             constant = float((curved * (score - 0.5 * shift)).sum())
             score = score - shift
         return Evidence(information, score, constant, columns, self.rough_length_mm, self.hub, self.loose)
+
+    def perspective(self, move: Array) -> Array:
+        """What moves (N, 3) in camera axes do in the photograph beyond the linear, as moves, for targets of which only places are seen."""
+        out, rows = np.zeros_like(move), self.place_only
+        if len(rows):
+            at = self.changes.position_mm[rows]
+            before, by_point = self.camera.project_with_point_jacobian(at)
+            more = self.camera.project(at + move[rows]) - before - np.einsum("nij,nj->ni", by_point, move[rows])
+            back = np.swapaxes(by_point, 1, 2) @ np.linalg.inv(by_point @ np.swapaxes(by_point, 1, 2))
+            out[rows] = (back @ more[..., None])[..., 0]
+        return out
 
     def _hub(self) -> Array:
         """Places in `changes` of the targets on rigid parts."""
