@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.camera.model import Camera
-from dishmap.camera.undistort import undistort_image
+from dishmap.camera.undistort import undistort_image, undistort_points
 from dishmap.errors import FitError, InputError, MeasurementError
 from dishmap.surface.cloud import PointCloud, transform_cloud
 from dishmap.surface.fit import Basis, SurfaceFit, fit_surface, flag_off_surface
 from dishmap.targets.detect import Detections, find_ellipses
 from dishmap.targets.grid_detect import GridDetections, find_grid
 from dishmap.targets.grid_identify import GridIdentity, identify_grid
+from dishmap.targets.grid_paper import paper_grid_poses
 from dishmap.targets.grid_poses import measure_grid_targets
-from dishmap.targets.identify import Hint, Identity, identify
+from dishmap.targets.identify import Anchors, Hint, Identity, identify
 from dishmap.targets.paper import PaperPoses, paper_poses
 from dishmap.targets.pattern import Pattern
 from dishmap.targets.pose import TargetPoses, check_image, measure_targets
@@ -63,14 +64,17 @@ def map_photograph(
 ) -> Map:
     """Measure all targets of `pattern` in one grey photograph (height, width) and fit a robust surface through them.
 
-    hint: Upright(), PoseGuess(...) or None, see `identify`. method: `pose` (raw pixels, with covariance) or `paper`
-    (Algorithm 1). surface: default is the pattern's own kind, a plane or a paraboloid. Raises ImageError, CameraError,
-    IdentityError and MeasurementError, each with what to do; a surface that cannot be fitted is told in `surface_problem`.
+    hint: Upright(), PoseGuess(...), Anchors(...) or None, see `identify` and `identify_grid`. method: `pose` (raw pixels, with
+    covariance) or `paper` (Algorithm 1, for grids Algorithm 2). surface: default is the pattern's own kind, such as a plane. Raises
+    ImageError, CameraError, IdentityError and MeasurementError, each with what to do; a surface that cannot be fitted is told in
+    `surface_problem`.
     """
     if method not in METHODS:
         raise InputError(f"unknown method {method!r}; use one of {', '.join(METHODS)}")
     check_image(image, camera)
     if method == "paper":
+        if isinstance(hint, Anchors):
+            hint = replace(hint, place_px=undistort_points(camera, hint.place_px))
         image, camera = undistort_image(camera, image)
     detections, identity, poses = (_of_grid if pattern.is_grid else _of_circles)(
         image, camera, pattern, hint, method, assumptions, progress
@@ -123,7 +127,7 @@ def _of_grid(
     identity = identify_grid(detections, pattern, camera, hint)
     if method == "paper":
         places = detections.place_px[identity.detection]
-        raise InputError("later")
+        return detections, identity, paper_grid_poses(image, camera, pattern, identity.index, places)
     return detections, identity, measure_grid_targets(image, camera, pattern, detections, identity, progress)
 
 
