@@ -29,6 +29,8 @@ FREE_MOVE_MM, FREE_TURN_RAD = 10.0, 0.03
 WAYS = {"least_strain": 4, "normal": 4, "axial": 4, "any": 8}
 # Degree of the displacement along the normal: what the targets can resolve, and a limit for the cost.
 SMALLEST_DEGREE, LARGEST_DEGREE = 4, 14
+# Terms that a surface may have besides its smooth random field: a rise as a whole, and those of the second degree.
+COMMON = np.array([0, 3, 4, 5])
 # Local unknowns of a target: rise and its two slopes, strain of its print xx, yy, xy.
 LOCAL = 6
 # Variance of a mode of the smooth field, relative to the largest, below which it is not followed.
@@ -109,20 +111,25 @@ class Kernel:
 
 
 def smooth_kernel(surfaces: Surfaces, length_mm: float) -> Kernel:
-    """Project a Matern 5/2 field (Rasmussen and Williams 2006, 4.2) of unit variance, and a mean of unit variance, on the normal terms."""
+    """Project a smooth random field on the normal terms.
+
+    A Matern 5/2 field (Rasmussen and Williams 2006, 4.2) of unit variance, and a mean, a defocus and both astigmatisms of unit variance each.
+    """
     points = surfaces.points
     distance = cdist(points, points) * (np.sqrt(5) / length_mm)
     kernel = (1 + distance + distance**2 / 3) * np.exp(-distance)
     covariance = surfaces.projection @ kernel @ surfaces.projection.T
-    # a field that changes over short lengths has hardly any mean of its own, and nothing says that the surface did not rise as a whole
-    covariance[0, 0] += 1.0
+    # a field that changes over short lengths has hardly any mean or broad bend of its own, and nothing says that the surface did not rise as
+    # a whole; heat and gravity bend dishes as a whole first
+    covariance[COMMON, COMMON] += 1.0
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     # what is left out counts as unexplained
     keep = values > LEAST_MODE * values.max()
     root = vectors[:, keep] * np.sqrt(values[keep])
-    rise = 2 - ((surfaces.value @ root) ** 2).sum(axis=1)
+    rise = 1 + (surfaces.value[:, COMMON] ** 2).sum(axis=1) - ((surfaces.value @ root) ** 2).sum(axis=1)
     # slopes of the field, mean of the two directions; a Matern 5/2 field has 5 / (3 length^2)
-    slopes = 5 / (3 * length_mm**2) - 0.5 * ((surfaces.slope @ root) ** 2).sum(axis=(1, 2)) / surfaces.fields.radius_mm**2
+    broad = (surfaces.slope[..., COMMON] ** 2).sum(axis=(1, 2)) - ((surfaces.slope @ root) ** 2).sum(axis=(1, 2))
+    slopes = 5 / (3 * length_mm**2) + 0.5 * broad / surfaces.fields.radius_mm**2
     return Kernel(length_mm, root, np.maximum(np.stack([rise, slopes], axis=-1), 0))
 
 
