@@ -58,7 +58,7 @@ ORDER = [
     *("targets.groups", "targets.paper", "targets.plane_pose", "targets.grid_corners", "targets.grid_paper"),
     *("targets.bound", "targets.expected", "targets.grid_bound"),
     # the surface through the points
-    *("surface.cloud", "surface.paraboloid", "surface.fit"),
+    *("surface.cloud", "surface.paraboloid", "surface.cylinder", "surface.fit"),
     # the difference between two photographs as the paper has it
     *("difference.registration", "difference.ratio", "difference.levels", "difference.paper"),
     # the rim that two photographs are compared against

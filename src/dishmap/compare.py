@@ -168,8 +168,8 @@ def check_method(method: str, surface: Basis | None) -> None:
     """Raise InputError for an unknown method, or a surface that no difference can have."""
     if method not in DIFFERENCE_METHODS:
         raise InputError(f"unknown method {method!r}; use one of {', '.join(DIFFERENCE_METHODS)}")
-    if surface is not None and surface.kind == "paraboloid":
-        raise InputError("a difference is a height over x, y: use a plane, polynomial or zernike surface, not a paraboloid")
+    if surface is not None and surface.along_normal:
+        raise InputError(f"a difference is a height over x, y: use a plane, polynomial or zernike surface, not a {surface.kind}")
 
 
 def compare_states(

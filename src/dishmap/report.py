@@ -95,7 +95,7 @@ def _surface(result: Map, numbers: Numbers) -> str:
 
 
 def _residual_figure(numbers: Numbers, fit: SurfaceFit) -> str:
-    along = "the surface's normal" if fit.basis.kind == "paraboloid" else "z of the dish frame"
+    along = "the surface's normal" if fit.basis.along_normal else "z of the dish frame"
     return figure(
         residual_map(numbers.dish.position_mm[:, :2], fit.residual_mm, fit.off_surface, fit.ids, "residual (mm)"),
         f"Residual of each target: its distance from the fitted {fit.basis.kind} along {along}, positive towards the camera's side. "

@@ -89,6 +89,15 @@ def rotation_from_vector(rotation_vector_rad: ArrayLike) -> Array:
     return np.eye(3) + np.sinc(angle / np.pi) * k + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (k @ k)
 
 
+def right_jacobian(rotation_vector_rad: ArrayLike) -> Array:
+    """J (3, 3) of a rotation vector v (3,) with exp(v + d) = exp(v) exp(J d) for small d (Sola et al. 2018, eq. 143)."""
+    v = np.asarray(rotation_vector_rad, dtype=float)
+    angle, k = float(np.linalg.norm(v)), cross_matrix(v)
+    if angle < 1e-4:
+        return np.asarray(np.eye(3) - k / 2 + k @ k / 6)
+    return np.asarray(np.eye(3) - (1 - np.cos(angle)) / angle**2 * k + (angle - np.sin(angle)) / angle**3 * k @ k)
+
+
 def vector_from_rotation(rotation: ArrayLike) -> Array:
     """Rotation vector (3,) in radians of one rotation matrix (3, 3)."""
     from scipy.spatial.transform import Rotation

@@ -84,7 +84,7 @@ def numbers_of(result: Map) -> Numbers:
     normal = nominal if fit is None else _surface_normals(fit, dish, nominal)
     ratio = None
     if known and fit is not None:
-        along = normal if fit.basis.kind == "paraboloid" else normal / normal[:, 2:]
+        along = normal if fit.basis.along_normal else normal / normal[:, 2:]
         ratio = fit.residual_mm / np.sqrt(np.einsum("ni,nij,nj->n", along, dish.covariance_mm2, along))
     return Numbers(
         dish=dish,

@@ -36,7 +36,9 @@ from dishmap.cli.terminal import progress
     show_default=True,
     help="Fit to the raw pixels, or the paper's Algorithm 1.",
 )
-@click.option("--surface", metavar="BASIS", help="plane, polynomial:DEGREE, zernike:DEGREE or paraboloid.  [default: as the pattern's]")
+@click.option(
+    "--surface", metavar="BASIS", help="plane, polynomial:DEGREE, zernike:DEGREE, paraboloid or cylinder.  [default: as the pattern's]"
+)
 @click.option("--spacecraft", type=PATH, metavar="FILE", help="Pose of the spacecraft's frame (JSON, spacecraft_from_camera).")
 @assumption_options
 def map_command(

@@ -275,8 +275,8 @@ def _check(lab: PointCloud, camera: Camera, basis: Basis, normals: str, surface_
         raise InputError(f"the surface goes through level 0 or a higher one, or None for the ratio map, not {surface_level}")
     if normals not in NORMALS:
         raise InputError(f"unknown normals {normals!r}; use one of {', '.join(NORMALS)}")
-    if basis.kind == "paraboloid":
-        raise InputError("a difference is a height over x, y: use a plane, polynomial or zernike surface, not a paraboloid")
+    if basis.along_normal:
+        raise InputError(f"a difference is a height over x, y: use a plane, polynomial or zernike surface, not a {basis.kind}")
     if camera.model != "opencv" or camera.distortion.any():
         raise CameraError("the paper's difference works on centres in undistorted images: give those and their pinhole camera")
     if lab.frame != "camera":

@@ -1,15 +1,18 @@
 """A smooth surface through a point cloud, robustly (the paper's Algorithm 4), with covariance.
 
 Plane, polynomial and Zernike surfaces are heights z over x, y of the cloud's frame, linear in their coefficients; what is
-left over is measured along z, its sigma being that of z minus slope times x, y. A paraboloid may lie in any attitude; what
-is left over is the exact orthogonal distance, positive on the focus's side, since that is what a dish's error means and it
-does not depend on the frame. Either way a point's own covariance, seen along that direction, is its prior weight.
+left over is measured along z, its sigma being that of z minus slope times x, y. A paraboloid or cylinder may lie in any attitude; what
+is left over is the exact orthogonal distance, since that is what a dish's error means and it does not depend on the frame: positive on the
+focus's side of a paraboloid, on the side of +z of a cylinder. Either way a point's own covariance, seen along that direction, is its
+prior weight.
 """
 
 from __future__ import annotations
 
 import difflib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,13 +22,13 @@ from scipy.special import ndtr, stdtrit
 from dishmap.errors import FitError, InputError
 from dishmap.quality import Quality
 from dishmap.robust import TUNING, RobustFit, mad_scale, robust_fit, robust_linear_fit
-from dishmap.surface import paraboloid
+from dishmap.surface import cylinder, paraboloid
 from dishmap.surface.cloud import PointCloud
 from dishmap.surface.zernike import LARGEST_DEGREE, term_name, zernike_gradient, zernike_matrix, zernike_terms
 
 Array = NDArray[np.float64]
 
-KINDS = ("plane", "polynomial", "zernike", "paraboloid")
+KINDS = ("plane", "polynomial", "zernike", "paraboloid", "cylinder")
 DEGREE_KINDS = ("polynomial", "zernike")
 # Twice: sigmas along z need the surface's slope, which the first pass gives.
 PASSES = 2
@@ -36,10 +39,58 @@ LEAST_CURVATURE_SIGMAS = 5.0
 
 
 @dataclass(frozen=True)
+class _Oriented:
+    """A surface that may lie in any attitude.
+
+    names, units of the numbers reported; start(points): placement and parameters; distances(points, placement, parameters); reported
+    and spread(placement, parameters): those numbers and their derivative; height(xy, numbers). Curvature is the last parameter.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    parameters: int
+    start: Callable[[Array], tuple[Any, Array]]
+    distances: Callable[[Array, Any, Array], tuple[Array, Array, Array]]
+    reported: Callable[[Any, Array], Array]
+    spread: Callable[[Any, Array], Array]
+    height: Callable[[Array, Array], tuple[Array, Array]]
+    curvature: str
+    instead: str
+
+
+ORIENTED = {
+    "paraboloid": _Oriented(
+        paraboloid.NAMES,
+        paraboloid.UNITS,
+        6,
+        paraboloid.start_placement,
+        paraboloid.distances,
+        paraboloid.Placement.vertex_axis_focal,
+        paraboloid.Placement.spread,
+        paraboloid.height_along_z,
+        "1/(4 f)",
+        "measure a larger part of the dish",
+    ),
+    "cylinder": _Oriented(
+        cylinder.NAMES,
+        cylinder.UNITS,
+        5,
+        cylinder.start_generator,
+        cylinder.distances,
+        cylinder.Generator.point_axis_radius,
+        cylinder.Generator.spread,
+        cylinder.height_along_z,
+        "1/radius",
+        "measure more of it around its axis",
+    ),
+}
+
+
+@dataclass(frozen=True)
 class Basis:
     """What kind of surface to fit.
 
-    kind: `plane`, `polynomial`, `zernike` or `paraboloid`; degree: of a polynomial or of Zernike terms; radius_mm: of the
+    kind: `plane`, `polynomial`, `zernike`, `paraboloid` or `cylinder`; degree: of a polynomial or of Zernike terms; radius_mm: of the
     Zernike disc (default: the farthest point), or the length by which a polynomial's x and y are divided; center_mm: x, y of
     the middle of the disc (default 0, 0) or of the plane's or polynomial's origin (default: the points' mean).
     """
@@ -58,6 +109,11 @@ class Basis:
         if self.radius_mm is not None and not (np.isfinite(self.radius_mm) and self.radius_mm > 0):
             raise InputError(f"the radius of a surface must be a positive number of mm, not {self.radius_mm}")
 
+    @property
+    def along_normal(self) -> bool:
+        """True for a surface in any attitude, to which distances are measured along its normal; False for a height over x, y."""
+        return self.kind in ORIENTED
+
 
 @dataclass(frozen=True)
 class SurfaceFit:
@@ -66,7 +122,7 @@ class SurfaceFit:
     basis: with degree, radius and centre filled in; frame: of the cloud; names, units (P,) of the coefficients (P,);
     covariance (P, P): from the points' own noise, scaled by what is left over; calibration_covariance (P, P): the part that
     all points share through the camera, or None if not asked for. ids (N,); weights (N,): bisquare, 0 where left out;
-    residual_mm (N,): point minus surface, along z or, for a paraboloid, along its normal; off_surface (N,): where that is
+    residual_mm (N,): point minus surface, along z or, for a paraboloid or cylinder, along its normal; off_surface (N,): where that is
     more than the noise explains. sigma_mm: robust standard deviation of the residuals; rms_mm: theirs without those off the
     surface; noise_factor: what is left over in units of the points' claimed sigmas (1 when those are true and the surface
     can follow the points), None when unweighted. converged, iterations: of the reweighting. hull_mm (H, 2): outline of the
@@ -102,7 +158,7 @@ class SurfaceHeights:
 
 
 def parse_basis(text: str) -> Basis:
-    """The basis of a text such as `plane`, `polynomial:3`, `zernike:6` or `paraboloid`. Raises InputError."""
+    """The basis of a text such as `plane`, `polynomial:3`, `zernike:6`, `paraboloid` or `cylinder`. Raises InputError."""
     kind, colon, degree = text.strip().lower().partition(":")
     if not colon:
         return Basis(kind, 4 if kind in DEGREE_KINDS else 1)
@@ -127,11 +183,10 @@ def fit_surface(
     Raises FitError when the points are too few for the surface, or do not determine it.
     """
     basis = basis or Basis()
-    basis = basis if basis.kind == "paraboloid" else _resolved(basis, cloud.position_mm)
+    basis = basis if basis.along_normal else _resolved(basis, cloud.position_mm)
     _check_count(basis, len(cloud))
-    if basis.kind == "paraboloid":
-        fit, normal, seven, spread = _fit_paraboloid(cloud, weighted, start)
-        coefficients = seven
+    if basis.along_normal:
+        fit, normal, coefficients, spread = _fit_oriented(cloud, basis.kind, weighted, start)
     else:
         fit, normal = _fit_heights(cloud, basis, weighted, start)
         coefficients, spread = fit.coefficients, np.eye(len(fit.coefficients))
@@ -163,11 +218,11 @@ def surface_heights(fit: SurfaceFit, x_mm: ArrayLike, y_mm: ArrayLike) -> Surfac
     """Heights of a fitted surface at x, y (broadcast together) of its frame.
 
     The sigma is that of the surface itself, own noise and, where the fit has it, calibration together. NaN where a
-    paraboloid has no point above x, y.
+    paraboloid or cylinder has no point above x, y.
     """
     x, y = np.broadcast_arrays(np.asarray(x_mm, dtype=float), np.asarray(y_mm, dtype=float))
-    if fit.basis.kind == "paraboloid":
-        height, by = paraboloid.height_along_z(np.stack([x, y], axis=-1), fit.coefficients)
+    if fit.basis.along_normal:
+        height, by = ORIENTED[fit.basis.kind].height(np.stack([x, y], axis=-1), fit.coefficients)
     else:
         by = _design(fit.basis, x.ravel(), y.ravel()).reshape(*x.shape, -1)
         height = by @ fit.coefficients
@@ -194,7 +249,7 @@ def _resolved(basis: Basis, position: Array) -> Basis:
 
 
 def _check_count(basis: Basis, points: int) -> None:
-    count = 6 if basis.kind == "paraboloid" else (basis.degree + 1) * (basis.degree + 2) // 2
+    count = ORIENTED[basis.kind].parameters if basis.along_normal else (basis.degree + 1) * (basis.degree + 2) // 2
     if points > count:
         return
     most = max((d for d in range(LARGEST_DEGREE + 1) if (d + 1) * (d + 2) // 2 < points), default=-1)
@@ -219,30 +274,32 @@ def _fit_heights(cloud: PointCloud, basis: Basis, weighted: bool, start: str) ->
     return fit, normal
 
 
-def _fit_paraboloid(cloud: PointCloud, weighted: bool, start: str) -> tuple[RobustFit, Array, Array, Array]:
-    """The fit of six parameters, d residual / d position (N, 3), the seven numbers reported and their derivative (7, 6)."""
-    placement, parameters = paraboloid.start_placement(cloud.position_mm)
+def _fit_oriented(cloud: PointCloud, kind: str, weighted: bool, start: str) -> tuple[RobustFit, Array, Array, Array]:
+    """The fit of P parameters, d residual / d position (N, 3), the numbers reported (K,) and their derivative (K, P)."""
+    shape = ORIENTED[kind]
+    placement, parameters = shape.start(cloud.position_mm)
 
     def model(at: Array) -> tuple[Array, Array]:
-        distance, by, _ = paraboloid.distances(cloud.position_mm, placement, at)
+        distance, by, _ = shape.distances(cloud.position_mm, placement, at)
         return distance, -by
 
-    values, _, normal = paraboloid.distances(cloud.position_mm, placement, np.array([*parameters[:5], 0.0]))
+    values, _, normal = shape.distances(cloud.position_mm, placement, np.array([*parameters[:-1], 0.0]))
     for _ in range(PASSES):
         noise = _sigma_along(cloud, normal) if weighted else None
         try:
             fit = robust_fit(model, parameters, values, noise, TUNING, start)
         except FitError as error:
-            raise FitError(f"the points do not determine a paraboloid (are they flat?): {error}") from error
+            raise FitError(f"the points do not determine a {kind} (are they flat?): {error}") from error
         parameters, start = fit.coefficients, "given"
-        normal = paraboloid.distances(cloud.position_mm, placement, parameters)[2]
-    curvature, sigma = parameters[5], float(np.sqrt(fit.covariance[5, 5]))
-    if not curvature > LEAST_CURVATURE_SIGMAS * sigma:
+        normal = shape.distances(cloud.position_mm, placement, parameters)[2]
+    curvature, sigma = parameters[-1], float(np.sqrt(fit.covariance[-1, -1]))
+    # the start turns a paraboloid's focus to its hollow side, so that its curvature is positive; a cylinder may be hollow
+    if not (curvature if kind == "paraboloid" else abs(curvature)) > LEAST_CURVATURE_SIGMAS * sigma:
         raise FitError(
-            f"the points show no curvature for a paraboloid: 1/(4 f) is {curvature:.3g} with a sigma of {sigma:.3g} per mm; "
-            "fit a plane or measure a larger part of the dish"
+            f"the points show no curvature for a {kind}: {shape.curvature} is {curvature:.3g} with a sigma of {sigma:.3g} per mm; "
+            f"fit a plane or {shape.instead}"
         )
-    return fit, normal, placement.vertex_axis_focal(parameters), placement.spread(parameters)
+    return fit, normal, shape.reported(placement, parameters), shape.spread(placement, parameters)
 
 
 def _sigma_along(cloud: PointCloud, normal: Array) -> Array:
@@ -280,8 +337,8 @@ def _exponents(degree: int) -> list[tuple[int, int]]:
 
 
 def _names_units(basis: Basis) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    if basis.kind == "paraboloid":
-        return paraboloid.NAMES, paraboloid.UNITS
+    if basis.along_normal:
+        return ORIENTED[basis.kind].names, ORIENTED[basis.kind].units
     if basis.kind == "plane":
         return ("height", "slope_x", "slope_y"), ("mm", "mm/mm", "mm/mm")
     if basis.kind == "polynomial":

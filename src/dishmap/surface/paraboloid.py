@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dishmap.errors import FitError
-from dishmap.transforms import cross_matrix, rotation_from_vector
+from dishmap.transforms import cross_matrix, right_jacobian, rotation_from_vector
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ class Placement:
         out[:3, :3] = np.eye(3)
         turn = rotation_from_vector([*parameters[3:5], 0.0])
         # a turn d to the right of the rotation moves its z axis by d x z
-        out[3:6, 3:5] = (self.rotation @ turn @ -cross_matrix([0.0, 0.0, 1.0]) @ _right_jacobian(parameters[3:5]))[:, :2]
+        out[3:6, 3:5] = (self.rotation @ turn @ -cross_matrix([0.0, 0.0, 1.0]) @ right_jacobian([*parameters[3:5], 0.0]))[:, :2]
         out[6, 5] = -0.25 / parameters[5] ** 2
         return out
 
@@ -110,7 +110,7 @@ def distances(points_mm: ArrayLike, placement: Placement, parameters: Array) -> 
     gap = local - np.column_stack([foot[:, None] * outward, c * foot**2])
     by = np.empty((len(p), 6))
     by[:, :3] = -normal @ rotation.T
-    by[:, 3:5] = _cross(normal, local) @ _right_jacobian(parameters[3:5])[:, :2]
+    by[:, 3:5] = _cross(normal, local) @ right_jacobian([*parameters[3:5], 0.0])[:, :2]
     by[:, 5] = -(foot**2) * normal[:, 2]
     return (gap * normal).sum(axis=1), by, normal @ rotation.T
 
@@ -152,12 +152,3 @@ def _cross(a: Array, b: Array) -> Array:
     """Cross products (N, 3); numpy's own is slow for so few rows."""
     (ax, ay, az), (bx, by, bz) = a.T, b.T
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
-
-
-def _right_jacobian(turn_xy: Array) -> Array:
-    """J (3, 3) with exp(v + d) = exp(v) exp(J d) for small d, v = (turn_xy, 0)."""
-    v = np.array([*turn_xy, 0.0])
-    angle, k = float(np.linalg.norm(v)), cross_matrix(v)
-    if angle < 1e-4:
-        return np.asarray(np.eye(3) - k / 2 + k @ k / 6)
-    return np.asarray(np.eye(3) - (1 - np.cos(angle)) / angle**2 * k + (angle - np.sin(angle)) / angle**3 * k @ k)
