@@ -84,7 +84,18 @@ ORDER = [
     *("io.scenario_pattern", "io.scenario_file", "io.truth_file", "io.points_file", "io.measurement_file", "io.results"),
     *("io.difference_file", "io.difference_results", "io.board_file", "io.sheet_file"),
     # people: what a map says in words, in pictures, on a page
-    *("verdict", "plot.canvas", "plot.photograph", "plot.maps", "plot.outlines", "plot.scene", "plot.calibration", "page", "report"),
+    *(
+        "verdict",
+        "plot.canvas",
+        "plot.photograph",
+        "plot.maps",
+        "plot.grid_outlines",
+        "plot.outlines",
+        "plot.scene",
+        "plot.calibration",
+        "page",
+        "report",
+    ),
     "calibration_report",
     # and what a difference says
     *("difference_verdict", "difference_assumptions", "plot.difference", "plot.difference_photograph", "plot.difference_scene"),

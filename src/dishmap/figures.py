@@ -1,4 +1,4 @@
-"""A difference in a few numbers, and two methods beside each other."""
+"""A map or a difference in a few numbers, and two methods beside each other."""
 
 from __future__ import annotations
 
@@ -7,10 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dishmap.camera.model import Camera
 from dishmap.compare import Difference, DifferenceTable
+from dishmap.difference.changes import rigid_columns
 from dishmap.errors import MeasurementError
+from dishmap.pipeline import Map
+from dishmap.quality import Quality
+from dishmap.targets.pose import TargetPoses
 
 Array = NDArray[np.float64]
+
+# The undeformed pattern is off by its shape where it is off by this much more than all else leaves.
+SHAPE_SHOWS = 2.0
 
 
 @dataclass(frozen=True)
@@ -29,6 +37,25 @@ class Figures:
 
 
 @dataclass(frozen=True)
+class Reprojection:
+    """How well the places of a grid's clean targets are explained: root mean square distances in the photograph, px.
+
+    smooth_rms_px: from the smooth surface through the targets; rigid_rms_px: from the undeformed pattern in its best rigid pose. noise_px,
+    printing_px, calibration_px (NaN if unknown): what the photograph's noise, printing errors and the error of the calibration (without
+    what a rigid motion explains) would leave. smooth_limit, rigid_limit: which of them is largest, or `shape` where the surface's own shape
+    explains most.
+    """
+
+    smooth_rms_px: float
+    rigid_rms_px: float
+    noise_px: float
+    printing_px: float
+    calibration_px: float
+    smooth_limit: str
+    rigid_limit: str
+
+
+@dataclass(frozen=True)
 class Apart:
     """How far two methods disagree over the targets that both give: root mean squares in mm."""
 
@@ -36,6 +63,36 @@ class Apart:
     displacement_rms_mm: float
     depth_change_rms_mm: float
     shape_rms_mm: float
+
+
+def reprojection_of(result: Map) -> Reprojection | None:
+    """How well places of a grid are explained; None for targets made of circles, and for the paper's method."""
+    poses = result.poses
+    if not isinstance(poses, TargetPoses) or poses.sheet is None:
+        return None
+    clean = poses.quality == 0
+    used = clean if clean.any() else (poses.quality & int(Quality.OUTLIER)) == 0
+    nominal = result.camera.project(result.camera_from_dish.apply(result.pattern.center_mm[poses.index[used]]))
+    rigid = float(np.sqrt(((poses.center_px[used] - nominal) ** 2).sum(axis=1).mean()))
+    sheet, calibration = poses.sheet, _calibration_px(result.camera, poses.position_mm[used])
+    known = {"noise": sheet.noise_rms_px, "printing": sheet.print_rms_px}
+    smooth_limit = max(known, key=known.__getitem__)
+    known["calibration"] = calibration if np.isfinite(calibration) else 0.0
+    expected = float(np.sqrt(sum(part**2 for part in known.values())))
+    limit = "shape" if rigid > SHAPE_SHOWS * max(expected, sheet.fit_rms_px) else max(known, key=known.__getitem__)
+    return Reprojection(sheet.fit_rms_px, rigid, sheet.noise_rms_px, sheet.print_rms_px, calibration, smooth_limit, limit)
+
+
+def _calibration_px(camera: Camera, position_mm: Array) -> float:
+    """Root mean square error of the images of points (N, 3) by the camera's calibration, what a rigid motion of them explains left out."""
+    if camera.covariance is None:
+        return float("nan")
+    _, by_point, by_parameter = camera.project_with_jacobians(position_mm)
+    motion = (by_point @ rigid_columns(position_mm - position_mm.mean(axis=0))).reshape(-1, 6)
+    change = by_parameter.reshape(len(motion), -1)
+    scale = np.linalg.norm(motion, axis=0)
+    change = change - motion @ (np.linalg.lstsq(motion / scale, change, rcond=None)[0] / scale[:, None])
+    return float(np.sqrt(np.einsum("ni,ij,nj->", change, camera.covariance, change) / len(position_mm)))
 
 
 def figures_of(table: DifferenceTable) -> Figures:

@@ -39,7 +39,7 @@ MEANING: dict[Quality, str] = {
     Quality.OFF_SURFACE: "the target lies, or moved, far from the surface through its neighbours",
     Quality.NOT_CONVERGED: "the fit to the pixels did not converge",
     Quality.WEAK_DEPTH: "depth rests on the assumed ink spread (a lone disc), not on the image alone",
-    Quality.OUTLIER: "its change fits no smooth motion of the surface; the value is what its neighbours say",
+    Quality.OUTLIER: "its place fits no smooth surface, or its change no smooth motion of it; the value is what its neighbours say",
     Quality.NO_CONTRAST: "too little contrast between ink and ground for a measurement",
 }
 

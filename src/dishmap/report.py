@@ -22,7 +22,7 @@ from dishmap.plot.photograph import error_svg, photograph_frame, photograph_svg
 from dishmap.plot.scene import exaggeration, scene_of
 from dishmap.quality import MEANING, names
 from dishmap.surface.fit import SurfaceFit
-from dishmap.verdict import Numbers, Verdict, number, numbers_of, rejected_targets, targets, unused_marks, verdict_of
+from dishmap.verdict import Numbers, Verdict, number, numbers_of, rejected_targets, sheet_words, targets, unused_marks, verdict_of
 
 Array = NDArray[np.float64]
 
@@ -46,6 +46,7 @@ def map_report(result: Map, image: NDArray[np.generic], title: str, inputs: dict
         _photograph(result, numbers, image),
         _surface(result, numbers),
         _targets(result, numbers),
+        _sheet(result),
         calibration_error_section(result.camera, image),
         _quality(result),
         _table(result, numbers),
@@ -65,7 +66,8 @@ def _photograph(result: Map, numbers: Numbers, image: NDArray[np.generic]) -> st
     alt = f"The photograph with {targets(len(result.cloud))} outlined, {len(lost)} rejected and {len(result.missing)} not seen."
     how = "coloured by the sigma of its depth" if numbers.sigma_depth_mm is not None else "in blue, since the method gives no sigmas"
     rest = " Red and dashed with a cross: seen but rejected." if lost else ""
-    rest += " White and dashed: where a target that was not seen would be, were the surface undeformed." if result.missing else ""
+    where = "its neighbours have it" if result.pattern.is_grid else "it would be, were the surface undeformed"
+    rest += f" White and dashed: a target that was not seen, where {where}." if result.missing else ""
     rest += " Thin dotted red: looks like a mark, but is not one of the pattern." if result.identity.rejected else ""
     frame = photograph_frame(image, outlines)
     part = f"Columns {frame.columns[0]} to {frame.columns[1] - 1}, rows {frame.rows[0]} to {frame.rows[1] - 1} of the photograph."
@@ -136,6 +138,18 @@ def _targets(result: Map, numbers: Numbers) -> str:
         f"Arrows of normals against the {reference}, median {number(float(np.median(angle)))} degrees.",
     )
     return section("Depth and normals", why, charts(first, second))
+
+
+def _sheet(result: Map) -> str:
+    """What the joint estimate of a grid learnt of print and film."""
+    rows = sheet_words(result)
+    if not rows:
+        return ""
+    about = paragraph(
+        "A grid is measured as one smooth sheet: places in the photograph, printed lengths along the surface and smoothness hold it "
+        "together, and how far each may be off is learnt from the photograph. The sigmas of all targets hold these sizes."
+    )
+    return section("What the grid showed of its print", about, table(("what", "value", "meaning"), rows, (0, 1, 2)))
 
 
 def _coefficients(fit: SurfaceFit) -> str:

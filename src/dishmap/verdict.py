@@ -8,10 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dishmap.figures import reprojection_of
 from dishmap.pipeline import Map
 from dishmap.quality import MEANING, Quality
 from dishmap.surface.cloud import PointCloud, calibration_covariance_mm2, transform_cloud
-from dishmap.surface.fit import SurfaceFit, surface_heights
+from dishmap.surface.fit import SurfaceFit, radius_of, surface_heights
+from dishmap.targets.pose import TargetPoses
 from dishmap.transforms import angle_between_rad
 
 Array = NDArray[np.float64]
@@ -24,11 +26,20 @@ FEWEST_FOR_FACTOR = 20
 SLOPE_STEP = 1e-4
 # So many ids are written out in a sentence.
 MOST_IDS = 12
+# Edges of squares that lie outside their printed place by more than this part of the side are not where the pattern file has them.
+WRONG_SIDE_PART = 0.05
+LIMITS = {
+    "noise": "the photograph's noise",
+    "printing": "printing",
+    "calibration": "the calibration",
+    "shape": "the surface's own shape",
+}
 # Flags that say something about the measurement's trust, in the order in which they are told.
 TOLD = (
     Quality.WEAK_DEPTH,
     Quality.AMBIGUOUS_NORMAL,
     Quality.OFF_SURFACE,
+    Quality.OUTLIER,
     Quality.POOR_FIT,
     Quality.GLARE,
     Quality.OCCLUDED,
@@ -179,14 +190,74 @@ def _facts(result: Map, numbers: Numbers) -> list[Fact]:
     if numbers.calibration_depth_mm is not None:
         shared = numbers.calibration_depth_mm
         facts.append(Fact("Calibration's part of depth", f"{number(float(np.median(shared)))} mm", "median; common to all targets"))
+    reprojection = reprojection_of(result)
+    if reprojection is not None:
+        to = f"to the smooth surface; {LIMITS[reprojection.smooth_limit]} limits it"
+        facts.append(Fact("Reprojection, rms", f"{number(reprojection.smooth_rms_px)} px", to))
     fit = result.surface
     if fit is not None:
         off = int(fit.off_surface.sum())
         kept = f"{targets(len(fit.ids) - off)}{f', {off} off the surface' if off else ''}"
         facts.append(Fact(f"Rms to the {_surface_name(result)}", f"{number(fit.rms_mm)} mm", kept))
+        if (radius := radius_of(fit)) is not None:
+            beside = radius.calibration_sigma_radius_mm
+            more = f"; calibration ± {number(beside)} mm" if np.isfinite(beside) else ""
+            side = "bulges towards the camera's side" if radius.radius_mm > 0 else "hollow on the camera's side"
+            own = f"± {number(radius.sigma_radius_mm)} mm from noise{more}; {side}"
+            facts.append(Fact("Radius of the cylinder", f"{abs(radius.radius_mm):.3f} mm", own))
         if fit.noise_factor is not None:
             facts.append(Fact("Residual / claimed sigma", number(fit.noise_factor), "1 if noise is all there is"))
     return facts
+
+
+def sheet_words(result: Map) -> list[tuple[str, str, str]]:
+    """What the joint estimate of a grid learnt: (what, value with unit, what it means); nothing for other maps."""
+    reprojection = reprojection_of(result)
+    if reprojection is None or not isinstance(result.poses, TargetPoses) or result.poses.sheet is None:
+        return []
+    sheet, r = result.poses.sheet, reprojection
+    edges = [
+        (
+            "Edges outside their printed place",
+            f"{sheet.spread_mm:.4f} ± {sheet.sigma_spread_mm:.4f} mm",
+            f"squares have sides of {sheet.measured_side_mm:.3f} mm, {sheet.side_mm:g} mm by the pattern file; ink spreads, or dries up",
+        )
+    ]
+    shared = "" if not np.isfinite(r.calibration_px) else f", an error of the calibration {number(r.calibration_px)} px"
+    return [
+        ("Printing error", f"{number(sheet.print_mm)} mm", "of a target's place on the sheet, per axis"),
+        ("Strain of single cells", percent(sheet.strain), "how far printed distances between neighbours differ from the pattern file's"),
+        ("Smooth strain", percent(sheet.smooth_strain), "the same, of a kind that whole parts of the sheet share"),
+        ("Roughness", f"{number(sheet.rough_mm)} mm", "third derivatives along the normal, per step of the grid cubed"),
+        *(edges if sheet.side_mm else []),
+        (
+            "Reprojection to the smooth surface",
+            f"{number(r.smooth_rms_px)} px rms",
+            f"the photograph's noise would leave {number(r.noise_px)} px, printing errors {number(r.printing_px)} px; "
+            f"{LIMITS[r.smooth_limit]} limits it",
+        ),
+        (
+            "Reprojection of the undeformed pattern",
+            f"{number(r.rigid_rms_px)} px rms",
+            f"in its best rigid pose; noise and printing errors as above{shared}; {LIMITS[r.rigid_limit]} limits it",
+        ),
+    ]
+
+
+def percent(share: float) -> str:
+    """A share in percent."""
+    return f"{number(100 * share)} %"
+
+
+def side_warning(result: Map) -> str:
+    """A sentence where squares are so much larger or smaller than the pattern file says that ink cannot be why; else nothing."""
+    sheet = result.poses.sheet if isinstance(result.poses, TargetPoses) else None
+    if sheet is None or not sheet.side_mm or abs(sheet.spread_mm) <= WRONG_SIDE_PART * sheet.side_mm:
+        return ""
+    return (
+        f"The pattern file's side of squares seems wrong: it says {sheet.side_mm:g} mm, and they measure {sheet.measured_side_mm:.3f} ± "
+        f"{2 * sheet.sigma_spread_mm:.1g} mm by the printed pitch. Places do not rest on it."
+    )
 
 
 def _warnings(result: Map, numbers: Numbers) -> list[str]:
@@ -202,6 +273,8 @@ def _warnings(result: Map, numbers: Numbers) -> list[str]:
         reasons = Counter(reason for _, reason in lost)
         said = "; ".join(f"{reason} ({id_list([i for i, r in lost if r == reason])})" for reason in reasons)
         out.append(f"{targets(len(lost))} seen but rejected: {said}.")
+    if wrong := side_warning(result):
+        out.append(wrong)
     if result.missing:
         out.append(f"{targets(len(result.missing))} not seen: {id_list(result.missing)}.")
     if result.surface is None:

@@ -45,8 +45,14 @@ def find_circle_boards(
 ) -> CircleSearch:
     """Find a flat pattern in each photograph (name, gray), given one after the other.
 
-    Raises InputError for a pattern that is not flat or photographs of different sizes, MeasurementError when no photograph shows it.
+    Raises InputError for a grid, a pattern that is not flat or photographs of different sizes, MeasurementError when no photograph shows
+    the board.
     """
+    if pattern.is_grid:
+        raise InputError(
+            f"the pattern {pattern.name!r} is a grid, and a calibration board is a chessboard, a ChArUco board or a plate of circles: "
+            "photograph one of those"
+        )
     if pattern.surface.kind != "plane" or np.ptp(pattern.center_mm[:, 2]) > 0:
         raise InputError(f"the pattern {pattern.name!r} is not flat; a calibration board is a plane")
     views: list[BoardView] = []

@@ -34,7 +34,7 @@ from dishmap.cli.terminal import progress
     type=click.Choice(["pose", "paper"]),
     default="pose",
     show_default=True,
-    help="Fit to the raw pixels, or the paper's Algorithm 1.",
+    help="Fit to the raw pixels, or the paper's Algorithm 1 (of a grid: 2).",
 )
 @click.option(
     "--surface", metavar="BASIS", help="plane, polynomial:DEGREE, zernike:DEGREE, paraboloid or cylinder.  [default: as the pattern's]"

@@ -43,6 +43,8 @@ def write_outcome(
 
 def print_summary(result: Map, title: str, folder: Path) -> None:
     """Print what was found and how well."""
+    from dishmap.surface.fit import radius_of
+
     cloud = result.cloud
     rejected = result.poses.rejected
     counts = f"{len(cloud)} of {len(result.pattern)} targets measured, {len(rejected)} rejected, {len(result.missing)} not seen"
@@ -52,9 +54,11 @@ def print_summary(result: Map, title: str, folder: Path) -> None:
         some = ", ".join(map(str, result.missing[:20])) + (", ..." if len(result.missing) > 20 else "")
         say(f"  not seen: {some}")
     others = Counter(found.reason for found in result.identity.rejected)
-    _print_few([f"  passed over: {count} circle{'s' * (count > 1)}: {reason}" for reason, count in others.most_common()])
+    what = ("crossing" if result.pattern.lines else "square") if result.pattern.is_grid else "circle"
+    _print_few([f"  passed over: {count} {what}{'s' * (count > 1)}: {reason}" for reason, count in others.most_common()])
     _print_flags(cloud.quality)
     _print_sigmas(result)
+    _print_sheet(result)
     fit = result.surface
     if fit is None:
         say(f"  no surface: {result.surface_problem}")
@@ -65,7 +69,11 @@ def print_summary(result: Map, title: str, folder: Path) -> None:
             if off
             else ""
         )
-        say(f"  surface ({_basis(result)}): rms {fit.rms_mm:.4g} mm{said}{'' if fit.converged else ', not converged'}")
+        radius = radius_of(fit)
+        size = "" if radius is None else f", radius {radius.radius_mm:.3f} +- {radius.sigma_radius_mm:.2g} mm"
+        if radius is not None and radius.calibration_sigma_radius_mm > 0:
+            size += f" (calibration +- {radius.calibration_sigma_radius_mm:.2g} mm)"
+        say(f"  surface ({_basis(result)}): rms {fit.rms_mm:.4g} mm{size}{said}{'' if fit.converged else ', not converged'}")
     say(f"report: {folder / REPORT}")
 
 
@@ -98,6 +106,19 @@ def _print_sigmas(result: Map) -> None:
         say(f"  besides, shared by all targets through the calibration: x {x:.2g}, y {y:.2g}, z {z:.2g} mm")
     else:
         say(f"  the part shared by all targets through the calibration is not known: {shared['reason']}")
+
+
+def _print_sheet(result: Map) -> None:
+    """What the joint estimate of a grid learnt."""
+    from dishmap.verdict import sheet_words, side_warning
+
+    words = [(f"{what[0].lower()}{what[1:]} {value}", meaning) for what, value, meaning in sheet_words(result)]
+    if words:
+        say(f"  learnt of the print: {', '.join(told for told, _ in words[:-2])}")
+    for told, meaning in words[-2:]:
+        say(f"  {told}: {meaning}")
+    if wrong := side_warning(result):
+        say(f"  {wrong}")
 
 
 def _print_flags(quality: NDArray[np.int64]) -> None:

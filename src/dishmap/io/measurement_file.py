@@ -11,7 +11,7 @@ import io
 import json
 import os
 import zipfile
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from dishmap.io.atomic import write_bytes
 from dishmap.io.pattern_file import format_pattern
 from dishmap.quality import Quality
 from dishmap.targets.pattern import Pattern
-from dishmap.targets.pose import TargetPoses
+from dishmap.targets.pose import SheetSummary, TargetPoses
 from dishmap.targets.scene_noise import NoiseModel
 from dishmap.transforms import Pose
 
@@ -95,6 +95,7 @@ def measurement_bytes(poses: TargetPoses, camera: Camera, pattern: Pattern, phot
         "noise": [float(noise.base), float(noise.slope), float(noise.inflation)],
         "log_gamma": float(poses.log_gamma),
         "rejected": [[int(ident), str(why)] for ident, why in poses.rejected],
+        "sheet": None if poses.sheet is None else {name: float(value) for name, value in asdict(poses.sheet).items()},
     }
     whole = {name: np.asarray(getattr(poses, name), dtype="<i8") for name in WHOLE}
     real = {name: np.asarray(getattr(poses, name), dtype="<f8") for name in REAL}
@@ -188,7 +189,12 @@ def _poses(header: dict[str, Any], arrays: dict[str, Array], camera: Camera, pat
         noise_model=NoiseModel(base, slope, inflation),
         log_gamma=_number(header["log_gamma"]),
         rejected=tuple((int(ident), str(why)) for ident, why in header["rejected"]),
+        sheet=_sheet(header["sheet"]),
     )
+
+
+def _sheet(content: dict[str, Any] | None) -> SheetSummary | None:
+    return None if content is None else SheetSummary(**{name: _number(value) for name, value in content.items()})
 
 
 def _check_columns(columns: dict[str, Array], pattern: Pattern) -> None:

@@ -23,13 +23,16 @@ from numpy.typing import NDArray
 from dishmap import __version__
 from dishmap.camera.model import Camera
 from dishmap.errors import InputError
+from dishmap.figures import reprojection_of
 from dishmap.io.atomic import write_files
 from dishmap.io.measurement_file import MEASUREMENT_FILE, measurement_bytes
 from dishmap.io.points_file import SIGMA_MM, format_ply, format_points, table_of
 from dishmap.io.pose_file import pose_content
 from dishmap.pipeline import Map
 from dishmap.surface.cloud import PointCloud, calibration_factor_mm, transform_cloud
-from dishmap.surface.fit import SurfaceFit
+from dishmap.surface.fit import SurfaceFit, radius_of
+from dishmap.targets.grid_detect import GridDetections
+from dishmap.targets.grid_identify import GridIdentity
 from dishmap.targets.identify import Anchors, Hint, PoseGuess
 from dishmap.targets.pose import TargetPoses
 from dishmap.targets.stages import Assumptions
@@ -135,6 +138,7 @@ def summary_text(result: Map, provenance: Provenance) -> str:
         "rejected": rejected,
         "missing": list(result.missing),
         "photograph": _photograph(result),
+        "sheet": _sheet(result),
         "surface": _surface_summary(result),
         "shared_calibration": shared_calibration(cloud, camera) if isinstance(result.poses, TargetPoses) else None,
         "alternatives_ruled_out": [
@@ -196,7 +200,26 @@ def _surface_summary(result: Map) -> dict[str, Any]:
     if fit is None:
         return {"fitted": False, "problem": result.surface_problem}
     off = [int(i) for i in fit.ids[fit.off_surface]]
-    return {"fitted": True, "kind": fit.basis.kind, "rms_mm": fit.rms_mm, "converged": bool(fit.converged), "off_surface": off}
+    return {
+        "fitted": True,
+        "kind": fit.basis.kind,
+        "rms_mm": fit.rms_mm,
+        "converged": bool(fit.converged),
+        "off_surface": off,
+        **({} if (radius := radius_of(fit)) is None else asdict(radius)),
+    }
+
+
+def _sheet(result: Map) -> dict[str, Any] | None:
+    """What the joint estimate of a grid learnt; null for targets made of circles and for the paper's method."""
+    poses = result.poses
+    if not isinstance(poses, TargetPoses) or poses.sheet is None:
+        return None
+    sheet, reprojection = poses.sheet, reprojection_of(result)
+    assert reprojection is not None
+    learnt = {"print_mm": sheet.print_mm, "strain": sheet.strain, "smooth_strain": sheet.smooth_strain, "rough_mm": sheet.rough_mm}
+    squares = {name: getattr(sheet, name) for name in ("side_mm", "measured_side_mm", "spread_mm", "sigma_spread_mm")}
+    return {**learnt, **(squares if sheet.side_mm else {}), "reprojection": asdict(reprojection)}
 
 
 def _photograph(result: Map) -> dict[str, Any] | None:
@@ -218,17 +241,19 @@ def _photograph(result: Map) -> dict[str, Any] | None:
 
 
 def _rejected(result: Map, camera: Camera) -> list[dict[str, Any]]:
-    """Everything seen and not used: targets by id, at the place where the pattern's pose puts them, and detections without a name."""
-    place_of = {int(i): p for i, p in zip(result.pattern.ids, result.pattern.center_mm, strict=True)}
-    out = []
-    for ident, reason in result.poses.rejected:
-        px = camera.project(result.camera_from_dish.apply(place_of[int(ident)]))
-        out.append({"id": int(ident), **_place(px), "reason": reason})
-    for found in result.identity.rejected:
-        px = result.detections.center_px[found.detection]
-        px = px if result.camera is camera else camera.project(result.camera.unproject(px))
-        out.append({"id": None, **_place(px), "reason": found.reason})
-    return out
+    """Everything seen and not used: targets by id, those of circles where the pattern's pose puts them, and detections without a name."""
+    found, identity = result.detections, result.identity
+    nominal = result.camera.project(result.camera_from_dish.apply(result.pattern.center_mm))
+    if isinstance(found, GridDetections) and isinstance(identity, GridIdentity):
+        # a bent sheet follows no rigid pose, and a node stands for one target
+        nominal[identity.index] = found.place_px[identity.detection]
+    seen = found.place_px if isinstance(found, GridDetections) else found.center_px
+    place_of = dict(zip(result.pattern.ids.tolist(), nominal, strict=True))
+    listed: list[tuple[int | None, Array, str]] = [(int(i), place_of[int(i)], reason) for i, reason in result.poses.rejected]
+    listed += [(None, seen[one.detection], one.reason) for one in identity.rejected]
+    if result.camera is not camera:
+        listed = [(ident, camera.project(result.camera.unproject(px)), reason) for ident, px, reason in listed]
+    return [{"id": ident, **_place(px), "reason": reason} for ident, px, reason in listed]
 
 
 def _place(pixel: Array) -> dict[str, float | None]:

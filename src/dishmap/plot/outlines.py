@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.camera.model import Camera
 from dishmap.errors import ImageError
 from dishmap.pipeline import Map
+from dishmap.plot.grid_outlines import grid_shapes, node_strokes
 from dishmap.plot.photograph import Outline
 from dishmap.quality import names
+from dishmap.targets.detect import Detections
+from dishmap.targets.grid_detect import GridDetections
+from dishmap.targets.identify import Identity
 from dishmap.targets.pattern import Pattern
 from dishmap.transforms import Pose
 from dishmap.verdict import Numbers, number, rejected_targets
@@ -19,41 +25,58 @@ Array = NDArray[np.float64]
 NOTHING = np.empty((0, 3, 2))
 
 
+@dataclass(frozen=True)
+class _Shapes:
+    """How the N targets of a pattern are drawn: ellipses or strokes of each; place_px (N, 2) of those not measured, NaN: not drawn."""
+
+    ellipses: list[Array]
+    strokes: list[tuple[Array, ...]]
+    place_px: Array
+
+
 def outlines_of(result: Map, numbers: Numbers) -> list[Outline]:
     """Outlines of all targets of a map, in pixels of the picture that was measured."""
-    ellipses, owner = _ellipses_px(result, result.identity.detection), result.pattern.marks.target[result.identity.mark]
+    shapes = _shapes(result)
     sigma = np.full(len(result.cloud), np.nan) if numbers.sigma_depth_mm is None else numbers.sigma_depth_mm
     out = []
-    for n, index in enumerate(result.poses.index.tolist()):
-        out.append(
-            Outline(
-                ellipses[owner == index],
-                result.cloud.center_px[n],
-                str(result.cloud.ids[n]),
-                _told(result, n, sigma[n]),
-                float(sigma[n]),
-                "good",
-            )
-        )
+    for n, i in enumerate(result.poses.index.tolist()):
+        name, told = str(result.cloud.ids[n]), _told(result, n, sigma[n])
+        out.append(Outline(shapes.ellipses[i], result.cloud.center_px[n], name, told, float(sigma[n]), "good", shapes.strokes[i]))
     place = {int(ident): i for i, ident in enumerate(result.pattern.ids.tolist())}
-    nominal = result.camera.project(result.camera_from_dish.apply(result.pattern.center_mm))
-    visible = result.camera.contains(nominal)
-    printed = nominal_ellipses(result.camera, result.pattern, result.camera_from_dish)
+    visible = result.camera.contains(shapes.place_px)
     for state, listed in (("rejected", rejected_targets(result)), ("missing", [(i, "not seen") for i in result.missing])):
         for ident, reason in listed:
-            index = place[ident]
-            own = ellipses[owner == index]
-            own = own if len(own) else printed[index]
-            if visible[index]:
-                out.append(Outline(own, nominal[index], str(ident), f"target {ident}: {reason}", np.nan, state))
+            i = place[ident]
+            if visible[i]:
+                told = f"target {ident}: {reason}"
+                out.append(Outline(shapes.ellipses[i], shapes.place_px[i], str(ident), told, np.nan, state, shapes.strokes[i]))
     return out
 
 
 def unused_outlines(result: Map) -> list[Outline]:
     """Outlines of what looks like a mark and was not used, with the reasons."""
-    listed = result.identity.rejected
-    ellipses = _ellipses_px(result, np.array([r.detection for r in listed], dtype=np.int64))
-    return [Outline(e[None], e[0], "", f"not used: {r.reason}", np.nan, "unused") for e, r in zip(ellipses, listed, strict=True)]
+    listed, found = result.identity.rejected, result.detections
+    which = np.array([r.detection for r in listed], dtype=np.int64)
+    titles = [f"not used: {r.reason}" for r in listed]
+    if isinstance(found, GridDetections):
+        strokes = node_strokes(result, found.place_px[which], found.step_px[which])
+        return [Outline(NOTHING, p, "", t, np.nan, "unused", s) for p, t, s in zip(found.place_px[which], titles, strokes, strict=True)]
+    return [Outline(e[None], e[0], "", t, np.nan, "unused") for e, t in zip(_ellipses_px(found, which), titles, strict=True)]
+
+
+def _shapes(result: Map) -> _Shapes:
+    count = len(result.pattern)
+    if result.pattern.is_grid:
+        place, strokes = grid_shapes(result)
+        return _Shapes([NOTHING] * count, strokes, place)
+    found, identity = result.detections, result.identity
+    assert isinstance(found, Detections)
+    assert isinstance(identity, Identity)
+    ellipses, owner = _ellipses_px(found, identity.detection), result.pattern.marks.target[identity.mark]
+    printed = nominal_ellipses(result.camera, result.pattern, result.camera_from_dish)
+    own = [ellipses[owner == i] for i in range(count)]
+    nominal = result.camera.project(result.camera_from_dish.apply(result.pattern.center_mm))
+    return _Shapes([seen if len(seen) else other for seen, other in zip(own, printed, strict=True)], [()] * count, nominal)
 
 
 def _told(result: Map, n: int, sigma_mm: float) -> str:
@@ -63,9 +86,8 @@ def _told(result: Map, n: int, sigma_mm: float) -> str:
     return f"target {result.cloud.ids[n]}: x {x:.2f}, y {y:.2f}, z {z:.2f} mm (camera frame){known}{', flags: ' + flags if flags else ''}"
 
 
-def _ellipses_px(result: Map, which: NDArray[np.int64]) -> Array:
+def _ellipses_px(found: Detections, which: NDArray[np.int64]) -> Array:
     """Centre and ends of both semi-axes (K, 3, 2) of detections."""
-    found = result.detections
     if not len(which):
         return NOTHING
     center, (major, minor) = found.center_px[which], found.semi_axes_px[which].T

@@ -28,6 +28,8 @@ CROP_MARGIN = 0.12
 SMALLEST_TEXT, LARGEST_TEXT = 8.0, 24.0
 # Width of a digit over its height, and the part of a target's spacing that its id may take.
 DIGIT_WIDTH, TEXT_PART = 0.6, 0.4
+# Lines are thinner where the next target is nearer than this, but not below that part.
+ROOMY, THINNEST = 45.0, 0.35
 WHITE_PERCENTILE = 99.5
 # The largest circle of expected error takes this part of the spacing of the grid.
 CIRCLE_PART = 0.48
@@ -37,10 +39,11 @@ LARGEST_TIMES_MEDIAN = 4.0
 
 @dataclass(frozen=True)
 class Outline:
-    """Ellipses (K, 3, 2) of one target, each as its centre and the ends of two conjugate radii, in pixels of the photograph.
+    """One target as it is drawn, in pixels of the photograph.
 
-    label: the text at `label_px`; title: what hovering tells; sigma: for the colour, NaN when unknown; state: `good`,
-    `rejected`, `missing` or `unused` (looks like a mark, is none).
+    ellipses_px (K, 3, 2): each as its centre and the ends of two conjugate radii; strokes_px: lines, each (P, 2); label: the text at
+    `label_px`; title: what hovering tells; sigma: for the colour, NaN when unknown; state: `good`, `rejected`, `missing` or `unused`
+    (looks like a mark, is none).
     """
 
     ellipses_px: Array
@@ -49,6 +52,12 @@ class Outline:
     title: str
     sigma: float
     state: str
+    strokes_px: tuple[Array, ...] = ()
+
+    @property
+    def points_px(self) -> Array:
+        """All points (P, 2) that are drawn."""
+        return np.concatenate([self.ellipses_px.reshape(-1, 2), *self.strokes_px])
 
 
 @dataclass(frozen=True)
@@ -87,7 +96,7 @@ def frame_of(width_px: int, height_px: int, around_px: Array | None = None) -> F
 
 def photograph_frame(image: NDArray[np.generic], outlines: list[Outline]) -> Frame:
     """The part of a photograph (H, W) that holds the pattern's targets, with a margin."""
-    points = [o.ellipses_px.reshape(-1, 2) for o in outlines if o.state != "unused"]
+    points = [o.points_px for o in outlines if o.state != "unused"]
     return frame_of(image.shape[1], image.shape[0], np.concatenate(points) if points else None)
 
 
@@ -96,11 +105,11 @@ def photograph_svg(image: NDArray[np.generic], frame: Frame, outlines: list[Outl
     sigma = np.array([o.sigma for o in outlines if o.state == "good"])
     known = sigma[np.isfinite(sigma)]
     norm = color_norm(known)
-    text = _text_size(frame, outlines)
+    text, thickness = _text_size(frame, outlines), _thickness(frame, outlines)
     body = [_picture(image, frame, JPEG_QUALITY)]
     for outline in outlines:
         color = hex_colors([outline.sigma], norm)[0] if np.isfinite(outline.sigma) else BLUE
-        body.append(_outline(frame, outline, color, text))
+        body.append(_outline(frame, outline, color, text, thickness))
     legend = _legend(frame, norm, sigma_label) if known.size else ""
     # an SVG of its own cuts outlines off at the picture's border
     picture = f'<svg width="{frame.width:.1f}" height="{frame.height:.1f}">{"".join(body)}</svg>'
@@ -170,18 +179,28 @@ def _text_size(frame: Frame, outlines: list[Outline]) -> float:
     if not named:
         return 0.0
     digits = max(len(o.label) for o in named)
-    at = frame.place(np.array([o.label_px for o in named]))
-    spacing = LARGEST_TEXT * digits
-    if len(at) > 1:
-        from scipy.spatial import cKDTree
-
-        nearest, _ = cKDTree(at).query(at, k=2)
-        spacing = float(np.quantile(nearest[:, 1], 0.02))
+    spacing = _spacing(frame, outlines)
+    spacing = spacing if np.isfinite(spacing) else LARGEST_TEXT * digits
     size = TEXT_PART * spacing / (DIGIT_WIDTH * max(digits, 2))
     return 0.0 if size < SMALLEST_TEXT else min(size, LARGEST_TEXT)
 
 
-def _outline(frame: Frame, outline: Outline, color: str, text: float) -> str:
+def _spacing(frame: Frame, outlines: list[Outline]) -> float:
+    """Distance in units to the next target, of nearly all of them; infinite for one alone."""
+    at = np.array([o.label_px for o in outlines if o.label])
+    if len(at) < 2:
+        return float("inf")
+    from scipy.spatial import cKDTree
+
+    return float(np.quantile(cKDTree(frame.place(at)).query(frame.place(at), k=2)[0][:, 1], 0.02))
+
+
+def _thickness(frame: Frame, outlines: list[Outline]) -> float:
+    """Of lines, relative to the usual one: thinner where targets stand close."""
+    return float(np.clip(_spacing(frame, outlines) / ROOMY, THINNEST, 1.0))
+
+
+def _outline(frame: Frame, outline: Outline, color: str, text: float, thickness: float) -> str:
     color = {"good": color, "rejected": "#e31a1c", "missing": "#ffffff", "unused": "#e31a1c"}[outline.state]
     dash = {"good": "", "unused": ' stroke-dasharray="2 3"'}.get(outline.state, ' stroke-dasharray="7 4"')
     rings = []
@@ -189,13 +208,18 @@ def _outline(frame: Frame, outline: Outline, color: str, text: float) -> str:
         (x, y), (ax, ay), (bx, by) = ellipse
         matrix = f"matrix({ax - x:.2f} {ay - y:.2f} {bx - x:.2f} {by - y:.2f} {x:.1f} {y:.1f})"
         rings.append(f'<circle r="1" transform="{matrix}" vector-effect="non-scaling-stroke"/>')
-    circles = "".join(rings)
+    if outline.strokes_px:
+        paths = (frame.place(stroke).tolist() for stroke in outline.strokes_px)
+        rings.append(f'<path d="{"".join("M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in path) for path in paths)}"/>')
+    shapes = "".join(rings)
     # a dark line under the coloured one keeps it visible on ink and on ground
-    lines = f'<g fill="none" stroke="#000000" stroke-width="3.6">{circles}</g>'
-    lines += f'<g fill="none" stroke="{color}" stroke-width="2.2"{dash}>{circles}</g>'
+    lines = f'<g fill="none" stroke="#000000" stroke-width="{3.6 * thickness:.2g}">{shapes}</g>'
+    lines += f'<g fill="none" stroke="{color}" stroke-width="{2.2 * thickness:.2g}"{dash}>{shapes}</g>'
     (x, y), name = frame.place(outline.label_px).tolist(), ""
     if outline.state == "rejected":
-        lines += f'<path d="M{x - 9:.1f} {y - 9:.1f}l18 18m0 -18l-18 18" stroke="#e31a1c" stroke-width="3.5"/>'
+        arm = 9 * thickness
+        cross = f"M{x - arm:.1f} {y - arm:.1f}l{2 * arm:.1f} {2 * arm:.1f}m0 {-2 * arm:.1f}l{-2 * arm:.1f} {2 * arm:.1f}"
+        lines += f'<path d="{cross}" stroke="#e31a1c" stroke-width="{3.5 * thickness:.2g}"/>'
         text, y = max(text, 16.0), y - 12 - 0.4 * max(text, 16.0)
     if outline.label and text:
         fill = RED if outline.state == "rejected" else INK

@@ -70,7 +70,7 @@ def start_generator(points_mm: ArrayLike) -> tuple[Generator, Array]:
     """A generator and parameters (5,) near the best cylinder through points (N, 3).
 
     For a given axis the rest is a circle through the points seen along it, so the axis alone is searched for. The normal is the one of
-    the points' side, on the side of +z; where points lie all around, the cylinder bulges. Raises FitError when the points show no curvature.
+    the points' side, on the side of +z; where points lie all around, the cylinder bulges. Raises FitError for points without curvature.
     """
     p = np.asarray(points_mm, dtype=float)
     middle = np.median(p, axis=0)

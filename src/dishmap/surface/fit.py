@@ -231,6 +231,27 @@ def surface_heights(fit: SurfaceFit, x_mm: ArrayLike, y_mm: ArrayLike) -> Surfac
     return SurfaceHeights(np.asarray(height), np.sqrt(np.maximum(variance, 0.0)), ~_inside(fit.hull_mm, x, y))
 
 
+@dataclass(frozen=True)
+class Radius:
+    """Radius of a fitted cylinder, positive where it bulges to +z of its frame; its sigma from the points' noise, and from calibration.
+
+    The latter is NaN where the fit does not hold it.
+    """
+
+    radius_mm: float
+    sigma_radius_mm: float
+    calibration_sigma_radius_mm: float
+
+
+def radius_of(fit: SurfaceFit) -> Radius | None:
+    """The radius of a cylinder, None of other surfaces."""
+    if "radius" not in fit.names:
+        return None
+    k, shared = fit.names.index("radius"), fit.calibration_covariance
+    sigma = float(np.sqrt(fit.covariance[k, k]))
+    return Radius(float(fit.coefficients[k]), sigma, float("nan") if shared is None else float(np.sqrt(shared[k, k])))
+
+
 def flag_off_surface(cloud: PointCloud, fit: SurfaceFit) -> PointCloud:
     """The cloud with the bit OFF_SURFACE set on the points that the fit found off the surface. Raises InputError for another cloud."""
     if not np.array_equal(cloud.ids, fit.ids):

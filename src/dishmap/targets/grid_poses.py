@@ -16,7 +16,7 @@ from dishmap.targets.grid_identify import GridIdentity
 from dishmap.targets.grid_points import GridPoints, measure_grid
 from dishmap.targets.grid_sheet import Sheet, estimate_sheet, target_axes
 from dishmap.targets.pattern import Pattern
-from dishmap.targets.pose import TargetPoses, check_image
+from dishmap.targets.pose import SheetSummary, TargetPoses, check_image
 from dishmap.targets.start import rigid_pose
 from dishmap.transforms import Pose
 
@@ -86,6 +86,32 @@ def poses_of(camera: Camera, pattern: Pattern, points: GridPoints, sheet: Sheet,
         noise_model=points.noise_model,
         log_gamma=0.0,
         rejected=points.rejected,
+        sheet=_summary(pattern, points, sheet, rotation),
+    )
+
+
+def _summary(pattern: Pattern, points: GridPoints, sheet: Sheet, rotation: Array) -> SheetSummary:
+    """What was learnt, and how far places lie from the smooth surface."""
+    sizes = sheet.sizes
+    noise = np.linalg.inv(points.information)[:, range(2), range(2)]
+    by_print = sizes.print_mm * (sheet.by_place[:, :2] @ rotation[..., :2])
+    clean = sheet.used & (points.quality == 0)
+    off, expected, printed = (
+        float(np.sqrt(per_target[clean if clean.any() else sheet.used].mean()))
+        for per_target in ((sheet.off_px**2).sum(axis=1), noise.sum(axis=1), (by_print**2).sum(axis=(1, 2)))
+    )
+    side = 0.0 if pattern.lines else 2 * float(np.median([np.abs(pattern.kind_of(i).polygons[0].corners_mm).max() for i in points.index]))
+    return SheetSummary(
+        print_mm=sizes.print_mm,
+        strain=sizes.strain,
+        smooth_strain=sizes.smooth_strain,
+        rough_mm=sizes.rough_mm,
+        side_mm=side,
+        spread_mm=sheet.spread_mm,
+        sigma_spread_mm=sheet.sigma_spread_mm,
+        fit_rms_px=off,
+        noise_rms_px=expected,
+        print_rms_px=printed,
     )
 
 

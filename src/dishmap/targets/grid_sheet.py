@@ -49,6 +49,7 @@ class Sheet:
     along columns, along rows) from noise, printing errors and the learnt sizes; by_camera (N, 9, P): their change with the camera's
     parameters; by_place (N, m, 3), by_turn (N, m, 3), by_spread (N, m): what a change of each target alone (place in the camera's axes,
     turn about the target's, edges moved outwards by 1 mm) does to what is measured of it; residual (N, m): measured less predicted, px;
+    off_px (N, 2): places measured less those of the smooth surface, printing errors included;
     used (N,): targets that shaped the surface; spread_mm and its sigma: how far edges of squares lie outside their printed place;
     sizes: what was learnt.
     """
@@ -62,6 +63,7 @@ class Sheet:
     by_turn: Array
     by_spread: Array
     residual: Array
+    off_px: Array
     used: Flags
     spread_mm: float
     sigma_spread_mm: float
@@ -155,6 +157,7 @@ def outcome(terms: Terms, state: State, system: System, sizes: Sizes, used: Flag
         by_turn,
         view.by_spread,
         system.residual - predicted_move,
+        system.residual[:, :2],
         used,
         state.spread_mm(terms),
         sigma,

@@ -67,6 +67,34 @@ WEAK_DEPTH_RATIO = 2.0
 
 
 @dataclass(frozen=True)
+class SheetSummary:
+    """What the joint estimate of a grid learnt of its sheet (`grid_sheet`), and how well places fit it.
+
+    print_mm: printing error of a target's place, per axis; strain: of single lattice cells; smooth_strain: of each smooth strain over the
+    sheet; rough_mm: third derivatives along the normal, mm per lattice step cubed; side_mm: printed side of squares by the pattern file,
+    spread_mm: how far their edges lie outside it, sigma_spread_mm, all three 0 for crossings. Root mean squares over clean targets, of
+    distances in the photograph: fit_rms_px between measured places and the smooth surface, of which noise_rms_px is expected from the
+    photograph's noise and print_rms_px from printing errors.
+    """
+
+    print_mm: float
+    strain: float
+    smooth_strain: float
+    rough_mm: float
+    side_mm: float
+    spread_mm: float
+    sigma_spread_mm: float
+    fit_rms_px: float
+    noise_rms_px: float
+    print_rms_px: float
+
+    @property
+    def measured_side_mm(self) -> float:
+        """The side of squares as the photograph has it, in lengths of the pattern's pitch; 0 for crossings."""
+        return self.side_mm + 2 * self.spread_mm
+
+
+@dataclass(frozen=True)
 class TargetPoses:
     """Measured targets (N,), in the camera frame.
 
@@ -79,7 +107,8 @@ class TargetPoses:
     d position / d camera parameters; blur_px (N,) total blur, offset_mm (N,) edge offset, contrast, noise (N,) grey levels;
     kept (N,) smallest share of a circle's edge that was used; quality (N,) bits of `Quality`.
     camera_from_dish: rigid pose of the undeformed pattern; normal_sigma_rad: spread of normals about the pattern's surface,
-    used as a prior; noise_model: of the photograph; rejected: (id, reason) of named targets that could not be measured.
+    used as a prior; noise_model: of the photograph; rejected: (id, reason) of named targets that could not be measured; sheet: what
+    was learnt of a grid, None for targets made of circles.
     """
 
     index: Index
@@ -106,6 +135,7 @@ class TargetPoses:
     noise_model: NoiseModel
     log_gamma: float
     rejected: tuple[tuple[int, str], ...]
+    sheet: SheetSummary | None = None
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -248,6 +278,7 @@ def _collect(
         noise_model=noise,
         log_gamma=shared.log_gamma,
         rejected=tuple(sorted(rejected)),
+        sheet=None,
         **kept,
     )
 

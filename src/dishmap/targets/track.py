@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from dishmap.camera.model import Camera
-from dishmap.errors import MeasurementError
+from dishmap.errors import InputError, MeasurementError
 from dishmap.targets.edges import Poses
 from dishmap.targets.pattern import Pattern, bent_print_mm
 from dishmap.targets.pose import TargetPoses, check_image, measure_groups, select_targets
@@ -33,8 +33,11 @@ def track_targets(
     """Measure the targets of an earlier photograph of the same scene again, each looked for where it was.
 
     No search and no naming: a target may have moved by up to TRACKED_PX in the image and keeps its name. Targets that moved farther are
-    listed in `rejected`; when fewer than half are found again, the whole is refused. Raises as `measure_targets`.
+    listed in `rejected`; when fewer than half are found again, the whole is refused. Raises as `measure_targets`,
+    and InputError for a grid.
     """
+    if pattern.is_grid:
+        raise InputError(f"the pattern {pattern.name!r} is a grid, which is found anew in every photograph: map it instead of tracking it")
     check_image(image, camera)
     assumptions = assumptions or Assumptions()
     there = _still_there(image, camera, pattern, reference)
