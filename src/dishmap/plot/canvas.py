@@ -36,6 +36,8 @@ STYLE: dict[Any, Any] = {
     "axes.formatter.useoffset": False,
     "legend.frameon": False,
 }
+# Dots in 3D: the usual size, up to so many of them, and the least.
+DOT, ROOMY_COUNT, SMALLEST_DOT = 4.5, 200, 1.5
 # Colours go by the logarithm where values span more than this factor.
 LOG_SPAN = 4.0
 
@@ -77,6 +79,11 @@ def hex_colors(values: ArrayLike, norm: Normalize) -> list[str]:
     """Colours `#rrggbb` of values (N,) on the sequential scale."""
     rgb = matplotlib.colormaps[SEQUENTIAL](norm(np.asarray(values, dtype=float)), bytes=True)
     return [f"#{r:02x}{g:02x}{b:02x}" for r, g, b, _ in np.atleast_2d(rgb).tolist()]
+
+
+def dot_size(count: int) -> float:
+    """Size of the dots of so many targets in a 3D picture: smaller where they would hide each other."""
+    return round(float(np.clip(DOT * np.sqrt(ROOMY_COUNT / max(count, 1)), SMALLEST_DOT, DOT)), 2)
 
 
 def round_length(length: float) -> float:

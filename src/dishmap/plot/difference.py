@@ -17,7 +17,7 @@ from scipy.stats import chi
 
 from dishmap.difference_verdict import ROUNDING, TOLD_SIGMAS
 from dishmap.plot.canvas import BLUE, DIVERGING, FAINT, INK, ORANGE, RED, SEQUENTIAL, Array, as_svg, new_figure
-from dishmap.plot.maps import dish_axes, fill_map, map_figure
+from dishmap.plot.maps import dish_axes, fill_map, map_figure, marks
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
@@ -59,7 +59,7 @@ def change_map(xy_mm: Array, change_mm: Array, sigma_mm: Array, aside: Bools, id
         if some.any():
             x, y = xy_mm[some].T
             colors: dict[str, Any] = {"c": change_mm[some], "cmap": DIVERGING, "norm": norm, "edgecolors": edge}
-            axes.scatter(x, y, s=size, linewidths=0.7, zorder=3, label=words, **colors)
+            axes.scatter(x, y, zorder=3, label=words, **{**marks(xy_mm, size), **colors})
     _crosses(axes, xy_mm, aside, ids)
     if np.isfinite(sigma_mm).any() or aside.any():
         _legend(figure)
@@ -75,7 +75,7 @@ def misfit_map(xy_mm: Array, misfit: Array, aside: Bools, ids: Ints) -> Figure:
     used = ~aside
     norm = Normalize(0.0, max(LEAST_MISFIT_SHOWN, float(misfit[used].max(initial=0.0))))
     x, y = xy_mm[used].T
-    axes.scatter(x, y, c=misfit[used], s=60, label="used", cmap=SEQUENTIAL, norm=norm, edgecolors=INK, linewidths=0.6, zorder=3)
+    axes.scatter(x, y, c=misfit[used], label="used", cmap=SEQUENTIAL, norm=norm, zorder=3, **marks(xy_mm, 60))
     _crosses(axes, xy_mm, aside, ids)
     if aside.any():
         _legend(figure)
@@ -102,7 +102,7 @@ def ratio_map_chart(place_mm: Array, pair: Ints, ratio: Array, used: Bools) -> F
     else:
         x, y = ends[used].mean(axis=1).T
         axes.scatter(x, y, c=percent[used], cmap=DIVERGING, norm=norm, s=9, zorder=2)
-    axes.scatter(place_mm[:, 0], place_mm[:, 1], s=10, color=INK, zorder=4)
+    axes.scatter(place_mm[:, 0], place_mm[:, 1], s=marks(place_mm, 10)["s"], color=INK, zorder=4)
     figure.colorbar(_mappable(norm, DIVERGING), ax=axes, label="ratio of distances - 1 (%)")
     dish_axes(axes, place_mm)
     return figure
@@ -164,7 +164,7 @@ def _crosses(axes: Axes, xy_mm: Array, aside: Bools, ids: Ints) -> None:
     if not aside.any():
         return
     x, y = xy_mm[aside].T
-    axes.scatter(x, y, marker="X", s=60, c=ORANGE, edgecolors=INK, linewidths=0.6, zorder=4, label="put aside")
+    axes.scatter(x, y, marker="X", c=ORANGE, zorder=4, label="put aside", **marks(xy_mm, 60))
     if aside.sum() <= MOST_NAMES:
         for (x, y), ident in zip(xy_mm[aside], ids[aside], strict=True):
             named = axes.annotate(str(ident), (x, y), xytext=(6, 6), textcoords="offset points", color=RED, fontsize=10, zorder=5)

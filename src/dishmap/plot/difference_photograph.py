@@ -18,6 +18,8 @@ ARROW_QUANTILE, SPACING_PART, ARROW_PART, LONGEST_SHOWN = 0.95, 0.8, 0.075, 1.6
 # Yellow stands out from ink and ground alike once it has a dark edge, orange-red tells what is cut; both for the colour-blind too.
 PLAIN, CUT = "#f0e442", ORANGE
 WIDTH, CASING, HEAD = 3.4, 6.6, 11.0
+# Arrows are thinner where most of them are shorter than this, but not below that part.
+ROOMY, THINNEST = 60.0, 0.3
 # Shorter arrows are drawn as their dot alone.
 SHORTEST = 2.0
 LEGEND_HEIGHT = 70.0
@@ -37,6 +39,11 @@ class Arrows:
     factor: float
     usual: float
     frame: Frame
+
+    @property
+    def thickness(self) -> float:
+        """Of lines and heads, relative to the usual ones."""
+        return float(np.clip(self.usual / ROOMY, THINNEST, 1.0))
 
     @property
     def cut(self) -> NDArray[np.bool_]:
@@ -64,7 +71,9 @@ def arrows_svg(image: NDArray[np.generic] | None, arrows: Arrows, alt: str) -> s
     longest = LONGEST_SHOWN * arrows.usual
     step = np.where(cut[:, None], step * (longest / np.maximum(np.hypot(*step.T), longest))[:, None], step)
     body = [_backdrop(image, frame)]
-    body += [_arrow(s, d, title, CUT if c else PLAIN) for s, d, title, c in zip(start, step, arrows.titles, cut, strict=True)]
+    body += [
+        _arrow(s, d, title, CUT if c else PLAIN, arrows.thickness) for s, d, title, c in zip(start, step, arrows.titles, cut, strict=True)
+    ]
     body.append(_legend(arrows))
     view = f"0 0 {frame.width:.1f} {frame.height + LEGEND_HEIGHT:.1f}"
     return (
@@ -80,18 +89,19 @@ def _backdrop(image: NDArray[np.generic] | None, frame: Frame) -> str:
     return whole[whole.index("<image") : whole.rindex("</svg>")]
 
 
-def _arrow(start: Array, step: Array, title: str, color: str) -> str:
+def _arrow(start: Array, step: Array, title: str, color: str, thickness: float) -> str:
     """A dot where the target was and an arrow to where it went, light on a dark edge."""
+    edge = f'stroke="{INK}" stroke-width="{1.6 * thickness:.3g}"'
     (x, y), length = start.tolist(), float(np.hypot(*step))
-    shape = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.6" fill="{color}" stroke="{INK}" stroke-width="1.6"/>'
+    shape = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{3.6 * thickness:.3g}" fill="{color}" {edge}/>'
     if length > SHORTEST:
         along = step / length
-        head = min(HEAD, length)
+        head = min(HEAD * thickness, length)
         tip, neck, side = start + step, start + step - head * along, 0.45 * head * np.array([-along[1], along[0]])
         line = f'<path d="M{_at(start)}L{_at(neck)}" '
-        shape += f'{line}stroke="{INK}" stroke-width="{CASING}"/>'
-        shape += f'<path d="M{_at(tip)}L{_at(neck + side)}L{_at(neck - side)}z" fill="{color}" stroke="{INK}" stroke-width="1.6"/>'
-        shape += f'{line}stroke="{color}" stroke-width="{WIDTH}"/>'
+        shape += f'{line}stroke="{INK}" stroke-width="{CASING * thickness:.3g}"/>'
+        shape += f'<path d="M{_at(tip)}L{_at(neck + side)}L{_at(neck - side)}z" fill="{color}" {edge}/>'
+        shape += f'{line}stroke="{color}" stroke-width="{WIDTH * thickness:.3g}"/>'
     return f"<g><title>{escape(title)}</title>{shape}</g>"
 
 
@@ -107,7 +117,7 @@ def _legend(arrows: Arrows) -> str:
     if longest == 0:
         return f'<text x="10" y="{middle + 8:.1f}" font-size="24" fill="{INK}">no target moved in the picture</text>'
     key = round_length(arrows.usual / per_px)
-    shape = _arrow(np.array([10.0, middle]), np.array([key * per_px, 0.0]), "", PLAIN)
+    shape = _arrow(np.array([10.0, middle]), np.array([key * per_px, 0.0]), "", PLAIN, arrows.thickness)
     words = f"{key:g} px in the picture" + (f", drawn {arrows.factor:g} times enlarged" if arrows.factor > 1 else "")
     words += "; orange: cut, longer than drawn" if arrows.cut.any() else ""
     return f'{shape}<text x="{key * per_px + 34:.1f}" y="{middle + 8:.1f}" font-size="24" fill="{INK}">{words}</text>'

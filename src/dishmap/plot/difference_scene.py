@@ -10,7 +10,7 @@ from scipy.spatial import Delaunay, QhullError
 
 from dishmap.compare import DifferenceTable
 from dishmap.difference_verdict import ROUNDING, set_aside, with_sigma
-from dishmap.plot.canvas import round_length
+from dishmap.plot.canvas import dot_size, round_length
 
 Array = NDArray[Any]
 
@@ -121,7 +121,7 @@ def _dots(table: DifferenceTable, points: Array, visible: bool) -> dict[str, Any
     marker = {
         "color": _listed(table.shape_mm, 6),
         **_colors(table),
-        "size": 4.5,
+        "size": dot_size(len(points)),
         "symbol": ["x" if a else "circle" for a in aside.tolist()],
         "line": {"color": "#1a1a1a", "width": 1},
         "colorbar": {"title": {"text": "change of<br>shape (mm)"}, "thickness": 16, "len": 0.7},

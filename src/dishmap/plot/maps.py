@@ -16,6 +16,7 @@ from dishmap.plot.canvas import BLUE, DIVERGING, FAINT, INK, ORANGE, RED, SEQUEN
 
 MAP_WIDTH_IN, MAP_BODY_IN, MAP_HEIGHTS_IN = 6.2, 4.6, (1.2, 6.0)
 CHART_IN = (6.2, 4.4)
+POINTS_PER_INCH = 72.0
 LEVELS = 20
 # Free room around the points, as a share of their span.
 MARGIN = 0.08
@@ -25,6 +26,10 @@ MOST_NAMES = 12
 LONGEST_ARROW, ARROW_QUANTILE = 0.12, 0.95
 # ... but are cut at so many times that length.
 LONGEST_SHOWN = 1.6
+# Marks are as large as asked where the next target is at least so far away, in points of the page; nearer ones make them smaller.
+ROOMY_PT, SMALLEST_PART = 16.0, 0.08
+# Arrows of normals reach at most so many times the way to the next target.
+ARROW_SPACINGS = 1.6
 # Beyond this factor the spread found is drawn beside the one claimed.
 SPREAD_WORTH_DRAWING = 1.5
 # Bins of a histogram hold on average so many points, within limits.
@@ -40,13 +45,9 @@ def residual_map(xy_mm: Array, residual_mm: Array, off: NDArray[np.bool_], ids: 
     largest = largest or float(np.abs(residual_mm).max()) or 1.0
     norm = Normalize(-largest, largest)
     fill_map(axes, xy_mm[on], residual_mm[on], norm, DIVERGING)
-    dots = axes.scatter(
-        xy_mm[on, 0], xy_mm[on, 1], c=residual_mm[on], cmap=DIVERGING, norm=norm, s=26, edgecolors=INK, linewidths=0.6, zorder=3
-    )
+    dots = axes.scatter(xy_mm[on, 0], xy_mm[on, 1], c=residual_mm[on], cmap=DIVERGING, norm=norm, zorder=3, **marks(xy_mm, 26))
     if off.any():
-        axes.scatter(
-            xy_mm[off, 0], xy_mm[off, 1], marker="X", s=60, c=ORANGE, edgecolors=INK, linewidths=0.6, zorder=4, label="off the surface"
-        )
+        axes.scatter(xy_mm[off, 0], xy_mm[off, 1], marker="X", c=ORANGE, zorder=4, label="off the surface", **marks(xy_mm, 60))
         axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderpad=0.0)
         if off.sum() <= MOST_NAMES:
             _name(axes, xy_mm[off], ids[off])
@@ -61,7 +62,7 @@ def sigma_map(xy_mm: Array, sigma: Array, label: str) -> Figure:
     figure, axes = map_figure(xy_mm)
     norm = color_norm(sigma)
     fill_map(axes, xy_mm, sigma, norm, SEQUENTIAL)
-    dots = axes.scatter(xy_mm[:, 0], xy_mm[:, 1], c=sigma, cmap=SEQUENTIAL, norm=norm, s=26, edgecolors=INK, linewidths=0.6, zorder=3)
+    dots = axes.scatter(xy_mm[:, 0], xy_mm[:, 1], c=sigma, cmap=SEQUENTIAL, norm=norm, zorder=3, **marks(xy_mm, 26))
     bar = figure.colorbar(dots, ax=axes, label=label)
     if isinstance(norm, LogNorm):
         # plain numbers instead of powers of ten
@@ -80,12 +81,13 @@ def normals_map(xy_mm: Array, lean_rad: Array, reference: str) -> Figure:
     typical = float(np.quantile(length_deg, ARROW_QUANTILE)) or float(length_deg.max()) or 1.0
     long = length_deg > LONGEST_SHOWN * typical
     shown = np.where(long[:, None], lean_deg * (LONGEST_SHOWN * typical / np.maximum(length_deg, typical))[:, None], lean_deg)
-    axes.scatter(xy_mm[:, 0], xy_mm[:, 1], s=7, c=FAINT, zorder=2)
+    axes.scatter(xy_mm[:, 0], xy_mm[:, 1], s=7 * _room(xy_mm), c=FAINT, zorder=2)
+    longest = min(LONGEST_ARROW, ARROW_SPACINGS * _spacing_part(xy_mm))
     style: dict[str, Any] = {
         "angles": "uv",
         "scale_units": "width",
-        "scale": typical / LONGEST_ARROW,
-        "width": 0.004,
+        "scale": typical / longest,
+        "width": 0.004 * longest / LONGEST_ARROW,
         "headwidth": 4,
         "headlength": 4.5,
         "zorder": 3,
@@ -133,6 +135,26 @@ def ratio_histogram(ratio: Array, spread: float) -> Figure:
 
 def _normal_curve(x: Array, spread: float) -> Array:
     return np.asarray(np.exp(-0.5 * (x / spread) ** 2) / (spread * np.sqrt(2 * np.pi)))
+
+
+def marks(xy_mm: Array, area_pt2: float) -> dict[str, Any]:
+    """Size and edges of marks at points (N, 2): `area_pt2` where there is room, smaller where the next one is near."""
+    room = _room(xy_mm)
+    return {"s": area_pt2 * room, "edgecolors": INK, "linewidths": 0.6 * np.sqrt(room)}
+
+
+def _room(xy_mm: Array) -> float:
+    """Area that a mark may take, as a part of the usual one."""
+    return float(np.clip((_spacing_part(xy_mm) * MAP_BODY_IN * POINTS_PER_INCH / ROOMY_PT) ** 2, SMALLEST_PART, 1.0))
+
+
+def _spacing_part(xy_mm: Array) -> float:
+    """Usual distance to the next point, as a part of the points' span; 1 for one alone."""
+    if len(xy_mm) < 2:
+        return 1.0
+    from scipy.spatial import cKDTree
+
+    return float(np.median(cKDTree(xy_mm).query(xy_mm, k=2)[0][:, 1])) / _span(xy_mm)
 
 
 def map_figure(xy_mm: Array, body_in: float = MAP_BODY_IN) -> tuple[Figure, Axes]:

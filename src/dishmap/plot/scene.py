@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.pipeline import Map
-from dishmap.plot.canvas import round_length
+from dishmap.plot.canvas import dot_size, round_length
 from dishmap.surface.fit import SurfaceFit, surface_heights
 from dishmap.verdict import Numbers, number
 
@@ -114,7 +114,7 @@ def _stems(result: Map, numbers: Numbers, fit: SurfaceFit, foot: Array, top: Arr
         "colorscale": PLOTLY_DIVERGING,
         "cmin": -limit,
         "cmax": limit,
-        "size": 4.5,
+        "size": dot_size(len(x)),
         "line": {"color": "#1a1a1a", "width": 1},
         "colorbar": {"title": {"text": "residual (mm)"}, "thickness": 16, "len": 0.7},
     }
