@@ -65,9 +65,9 @@ def map_photograph(
     """Measure all targets of `pattern` in one grey photograph (height, width) and fit a robust surface through them.
 
     hint: Upright(), PoseGuess(...), Anchors(...) or None, see `identify` and `identify_grid`. method: `pose` (raw pixels, with
-    covariance) or `paper` (Algorithm 1, for grids Algorithm 2). surface: default is the pattern's own kind: plane, paraboloid or cylinder. Raises
-    ImageError, CameraError, IdentityError and MeasurementError, each with what to do; a surface that cannot be fitted is told in
-    `surface_problem`.
+    covariance) or `paper` (Algorithm 1, for grids Algorithm 2). surface: default is the pattern's own kind: plane, paraboloid or
+    cylinder. Raises ImageError, CameraError, IdentityError and MeasurementError, each with what to do; a surface that cannot be
+    fitted is told in `surface_problem`.
     """
     if method not in METHODS:
         raise InputError(f"unknown method {method!r}; use one of {', '.join(METHODS)}")
@@ -122,8 +122,10 @@ def _of_grid(
     progress: Callable[[int, int], None] | None,
 ) -> tuple[GridDetections, GridIdentity, TargetPoses | PaperPoses]:
     if assumptions is not None and assumptions != Assumptions():
-        raise InputError("a grid learns what ink and surface do; leave out assumptions on ink, tone and normals "
-            "(--ink-spread-percent, --tone-shift-px, --normal-sigma-deg)")
+        raise InputError(
+            "a grid learns what ink and surface do; leave out assumptions on ink, tone and normals "
+            "(--ink-spread-percent, --tone-shift-px, --normal-sigma-deg)"
+        )
     detections = find_grid(image, bool(pattern.lines))
     identity = identify_grid(detections, pattern, camera, hint)
     if method == "paper":

@@ -193,7 +193,7 @@ def test_pickled_objects_and_bombs_are_not_opened() -> None:
 
 
 def test_every_field_with_rows_has_a_column() -> None:
-    alone = {"camera_from_dish", "normal_sigma_rad", "noise_model", "log_gamma", "rejected"}
+    alone = {"camera_from_dish", "normal_sigma_rad", "noise_model", "log_gamma", "rejected", "sheet"}
     assert {field.name for field in fields(TargetPoses)} == {*WHOLE, *REAL, *alone}
 
 

@@ -114,7 +114,7 @@ def hint_options(command: F) -> F:
     """`--pose-guess FILE`, `--upright` and `--anchor ID@U,V`: which way round the pattern is."""
     guess = "Approximate pose of the pattern, within 20 degrees and 100 mm (JSON, camera_from_dish)."
     upright = "The camera looks along the pattern's -z with its y up in the photograph, within 45 degrees."
-    anchor = "A target of a grid and where it is in the photograph (px as in points.csv, within half a step); may be repeated, and go with --upright."
+    anchor = "A target of a grid and where it is in the photograph: px as in points.csv, within half a step. May be repeated."
     command = click.option("--anchor", "anchors", type=Anchor(), multiple=True, metavar="ID@U,V", help=anchor)(command)
     command = click.option("--upright", is_flag=True, help=upright)(command)
     return click.option("--pose-guess", type=PATH, metavar="FILE", help=guess)(command)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from dishmap.plot.canvas import FAINT, INK, ORANGE, Array, round_length
-from dishmap.plot.photograph import BOX, Frame, frame_of, photograph_svg
+from dishmap.plot.photograph import BOX, JPEG_QUALITY, Frame, frame_of, picture
 
 # The arrow of this quantile takes this part of the way to the next target, or of the frame's larger side where that is less; longer
 # ones are cut at so many times that.
@@ -85,8 +85,7 @@ def arrows_svg(image: NDArray[np.generic] | None, arrows: Arrows, alt: str) -> s
 def _backdrop(image: NDArray[np.generic] | None, frame: Frame) -> str:
     if image is None:
         return f'<rect width="{frame.width:.1f}" height="{frame.height:.1f}" fill="#ffffff" stroke="{FAINT}"/>'
-    whole = photograph_svg(image, frame, [], "", "")
-    return whole[whole.index("<image") : whole.rindex("</svg>")]
+    return picture(image, frame, JPEG_QUALITY)
 
 
 def _arrow(start: Array, step: Array, title: str, color: str, thickness: float) -> str:

@@ -154,7 +154,7 @@ def _spacing_part(xy_mm: Array) -> float:
         return 1.0
     from scipy.spatial import cKDTree
 
-    return float(np.median(cKDTree(xy_mm).query(xy_mm, k=2)[0][:, 1])) / _span(xy_mm)
+    return float(np.median(cKDTree(xy_mm).query(xy_mm, k=2)[0][:, 1])) / _span(xy_mm) or 1.0
 
 
 def map_figure(xy_mm: Array, body_in: float = MAP_BODY_IN) -> tuple[Figure, Axes]:

@@ -106,14 +106,14 @@ def photograph_svg(image: NDArray[np.generic], frame: Frame, outlines: list[Outl
     known = sigma[np.isfinite(sigma)]
     norm = color_norm(known)
     text, thickness = _text_size(frame, outlines), _thickness(frame, outlines)
-    body = [_picture(image, frame, JPEG_QUALITY)]
+    body = [picture(image, frame, JPEG_QUALITY)]
     for outline in outlines:
         color = hex_colors([outline.sigma], norm)[0] if np.isfinite(outline.sigma) else BLUE
         body.append(_outline(frame, outline, color, text, thickness))
     legend = _legend(frame, norm, sigma_label) if known.size else ""
     # an SVG of its own cuts outlines off at the picture's border
-    picture = f'<svg width="{frame.width:.1f}" height="{frame.height:.1f}">{"".join(body)}</svg>'
-    return _svg(frame, 0.0, LEGEND_HEIGHT if known.size else 0.0, alt, [picture, legend])
+    clipped = f'<svg width="{frame.width:.1f}" height="{frame.height:.1f}">{"".join(body)}</svg>'
+    return _svg(frame, 0.0, LEGEND_HEIGHT if known.size else 0.0, alt, [clipped, legend])
 
 
 def error_svg(error: ProjectionError, width_px: int, height_px: int, alt: str, image: NDArray[np.generic] | None = None) -> str:
@@ -126,7 +126,7 @@ def error_svg(error: ProjectionError, width_px: int, height_px: int, alt: str, i
     units_per_px = CIRCLE_PART * spacing / largest if largest > 0 else 1.0
     back = f'<rect width="{frame.width:.1f}" height="{frame.height:.1f}" fill="#ffffff" stroke="{FAINT}"/>'
     if image is not None:
-        back += f'<g opacity="0.45">{_picture(image, frame, BACKGROUND_QUALITY, BACKGROUND_PART)}</g>'
+        back += f'<g opacity="0.45">{picture(image, frame, BACKGROUND_QUALITY, BACKGROUND_PART)}</g>'
     known = np.isfinite(sigma)
     circles = "".join(
         _error_circle(x, y, s, min(s, largest) * units_per_px, s > largest)
@@ -159,7 +159,7 @@ def _svg(frame: Frame, around: float, below: float, alt: str, body: list[str]) -
     )
 
 
-def _picture(image: NDArray[np.generic], frame: Frame, quality: int, part: float = 1.0) -> str:
+def picture(image: NDArray[np.generic], frame: Frame, quality: int, part: float = 1.0) -> str:
     """The framed part of the photograph, embedded as JPEG with up to `part` pixels a unit, never enlarged."""
     gray = np.asarray(image)[slice(*frame.rows), slice(*frame.columns)]
     if frame.scale * part < 1:
