@@ -113,14 +113,14 @@ class Kernel:
 def smooth_kernel(surfaces: Surfaces, length_mm: float) -> Kernel:
     """Project a smooth random field on the normal terms.
 
-    A Matern 5/2 field (Rasmussen and Williams 2006, 4.2) of unit variance, and a mean, a defocus and both astigmatisms of unit variance each.
+    A Matern 5/2 field (Rasmussen and Williams 2006, 4.2) and a mean, a defocus and both astigmatisms, all of unit variance.
     """
     points = surfaces.points
     distance = cdist(points, points) * (np.sqrt(5) / length_mm)
     kernel = (1 + distance + distance**2 / 3) * np.exp(-distance)
     covariance = surfaces.projection @ kernel @ surfaces.projection.T
-    # a field that changes over short lengths has hardly any mean or broad bend of its own, and nothing says that the surface did not rise as
-    # a whole; heat and gravity bend dishes as a whole first
+    # a field that changes over short lengths has hardly any mean or broad bend of its own, and nothing says that the surface did not rise
+    # as a whole; heat and gravity bend dishes as a whole first
     covariance[COMMON, COMMON] += 1.0
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     # what is left out counts as unexplained
