@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from dishmap.targets.grid_crossings import Level
 from dishmap.targets.grid_map import LocalMap, local_map
-from dishmap.targets.grid_refine import LEAST_DEPTH, LEAST_DEPTH_NOISE
+from dishmap.targets.grid_refine import LEAST_DEPTH
 from dishmap.targets.grid_walk import BRIDGE, table_of
 from dishmap.targets.threshold import noise_level, sampled
 
@@ -25,9 +25,11 @@ Flags = NDArray[np.bool_]
 
 # Samples per step, on tracks so far to both sides of a line, in steps.
 SAMPLES, ASIDE = 12, 0.14
-# A line is dark beyond this part of the depth of the lines at both ends. Pairs beside a pair (and itself) that have a
-# say in whether it is clear, and how many more of them must be clear than not to bridge a gap.
-DEPTH_PART, VOTERS, BRIDGE_VOTES = 0.45, 7, 3
+# A dip is the lowest of the samples up to a quarter of a step to both sides, and lower than the lightest on either side by this part of the
+# range on the track, and this many sigmas of the noise.
+QUARTER, DIP_PART, DIP_NOISE = 3, 0.12, 2.5
+# Pairs beside a pair (and itself) that have a say in whether it is clear, what part of them must be, and how many to bridge a gap.
+VOTERS, MOST_CLEAR, BRIDGE_VOTES = 9, 0.7, 3
 
 
 def unskipped(levels: list[Level], reduction: Ints, place_px: Array, lattice: Ints) -> Flags:
@@ -78,12 +80,12 @@ def _upheld(clear: Flags, apart: Ints, at: Ints, shape: tuple[int, ...], axis: i
     keep = clear.copy()
     for steps in range(1, BRIDGE + 1):
         chosen = np.flatnonzero(apart == steps)
-        needed = 0.5 if steps == 1 else BRIDGE_VOTES - 0.5
         for end in range(2):
             place = tuple(at[:, end, chosen])
-            votes = np.zeros(shape)
-            votes[place] = np.where(clear[chosen], 1.0, -1.0)
-            keep[chosen] &= VOTERS * uniform_filter1d(votes, VOTERS, axis=1 - axis, mode="constant")[place] > needed
+            pairs, cleared = np.zeros(shape), np.zeros(shape)
+            pairs[place], cleared[place] = 1.0, clear[chosen]
+            among, yes = (VOTERS * uniform_filter1d(t, VOTERS, axis=1 - axis, mode="constant")[place] for t in (pairs, cleared))
+            keep[chosen] &= (yes > MOST_CLEAR * among) & ((steps == 1) | (yes > BRIDGE_VOTES - 0.5))
     return keep
 
 
@@ -97,17 +99,18 @@ def _dips(level: Level, start: Array, end: Array, there: LocalMap, axis: int, ap
     steps = apart[:, None].astype(float)
     along = along + (end - start - steps * along - steps**2 * curve) / steps
     t = np.arange(BRIDGE * SAMPLES + 1) / SAMPLES
-    inside = t <= steps + 1e-9
     t = np.minimum(t, steps)[..., None]
     line = start[:, None] + t * along[:, None] + t**2 * curve[:, None]
-    least = max(LEAST_DEPTH, LEAST_DEPTH_NOISE * noise_level(level.image))
+    noise = noise_level(level.image)
+    between = (t[..., 0] > QUARTER / SAMPLES - 1e-9) & (t[..., 0] < steps - QUARTER / SAMPLES + 1e-9)
     counts = []
     for side in (-ASIDE, ASIDE):
         light = sampled(level.image, (line + side * other - (level.reduction - 1) / 2) / level.reduction)
-        last = light[:, -1]
         light[:, 1:-1] = (light[:, :-2] + light[:, 1:-1] + light[:, 2:]) / 3
-        depth = light.max(axis=1) - (light[:, 0] + last) / 2
-        dark = light < (light.max(axis=1) - DEPTH_PART * depth)[:, None]
-        begun = (dark[:, 1:] & ~dark[:, :-1] & inside[:, 1:]).sum(axis=1)
-        counts.append(np.where(depth > least, begun - dark[:, -1], 0))
+        depth = np.maximum(light.max(axis=1) - light.min(axis=1), 0.0)
+        prominence = np.maximum(DIP_PART * depth, DIP_NOISE * noise)[:, None]
+        lowest = minimum_filter1d(light, 2 * QUARTER + 1, axis=1) == light
+        before, after = (maximum_filter1d(light, QUARTER + 1, axis=1, origin=shift) for shift in (QUARTER // 2, -(QUARTER // 2) - 1))
+        dip = lowest & between & (light < np.minimum(before, after) - prominence)
+        counts.append(np.where(depth > LEAST_DEPTH, dip.sum(axis=1), 0))
     return np.asarray(np.minimum(*counts))
