@@ -24,11 +24,11 @@ SETTLED, LEAST_PART, LEARNT = 0.1, 1e-3, 0.15
 USUAL_STRAIN, LARGEST_CHANGE, RELAXATION = 1e-4, 10.0, 1.4
 # Least part of what a prior speaks of that is taken to be seen.
 FEWEST_FREE = 0.02
-# A first descent is held loosely, the next as learning begins.
+# Sizes as learning begins; where that does not settle, looser ones before.
 LOOSE_SIZES, FIRST_SIZES = Sizes(0.1, 1e-2, 1e-4, 0.1), Sizes(0.01, 1e-3, 1e-4, 0.02)
 # Less than any photograph shows, and what rounding allows; a film that stretched smoothly by more than the largest would not stay smooth.
 LEAST_SIZES, LARGEST_SIZES = Sizes(1e-5, 1e-5, 1e-7, 1e-5), Sizes(10.0, 0.1, 1e-3, 1e3)
-STEPS, LEARN_ROUNDS = 40, 20
+FIRST_STEPS, STEPS, LEARN_ROUNDS = 12, 40, 20
 # A target farther off than this many sigmas (of its noise, printing errors and what is left of the misfit of the others) is put aside.
 OUTLIER_SIGMAS = 5.0
 MOST_OUTLIERS = 0.3
@@ -39,9 +39,12 @@ MEDIAN_CHI2 = {2: 1.386, 6: 5.348}
 def learn(terms: Terms, tell: Callable[[int, int], None]) -> tuple[State, Sizes, Flags]:
     """A surface from scratch, the learnt sizes, and which targets fit."""
     shared = terms.strain_shapes.shape[2] + terms.squares
-    state, sizes, used = State(start_control(terms), np.zeros(shared)), FIRST_SIZES, np.ones(len(terms.cell), bool)
-    state, _, _ = descend(terms, state, LOOSE_SIZES, used, STEPS)
-    state, system, _ = descend(terms, state, sizes, used, STEPS)
+    start, sizes, used = State(start_control(terms), np.zeros(shared)), FIRST_SIZES, np.ones(len(terms.cell), bool)
+    state, system, settled = descend(terms, start, sizes, used, FIRST_STEPS)
+    if not settled:
+        # a rough start: let it find its shape before it is held to its lengths
+        state, _, _ = descend(terms, start, LOOSE_SIZES, used, STEPS)
+        state, system, _ = descend(terms, state, sizes, used, STEPS)
     for number in range(LEARN_ROUNDS):
         used = screened(terms, system, sizes, used)
         before, sizes = sizes, relearnt(terms, state, system, sizes)

@@ -111,6 +111,15 @@ class Spline:
         _, _, _, size, blocks = self._homes
         return size * blocks
 
+    def grouped(self, cell: Index) -> Index:
+        """Rows (cells, most) of what lies in each cell, given the cell (N,) of each; filled up with N, one past the last."""
+        order = np.argsort(cell, kind="stable")
+        count = np.bincount(cell, minlength=self.cells)
+        out = np.full((self.cells, max(int(count.max()), 1)), len(cell))
+        place = np.arange(len(order)) - np.repeat(np.cumsum(count) - count, count)
+        out[cell[order], place] = order
+        return out
+
     @cached_property
     def _gathering(self) -> csr_array:
         """The sum over cells of what stands for each unknown (unknowns, cells * 48)."""

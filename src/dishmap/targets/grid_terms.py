@@ -76,12 +76,7 @@ class Terms:
     @cached_property
     def in_cells(self) -> Index:
         """Targets of every cell (cells, most), filled up with N: one past the last."""
-        order = np.argsort(self.cell, kind="stable")
-        count = np.bincount(self.cell, minlength=self.spline.cells)
-        out = np.full((self.spline.cells, max(int(count.max()), 1)), len(self.cell))
-        place = np.arange(len(order)) - np.repeat(np.cumsum(count) - count, count)
-        out[self.cell[order], place] = order
-        return out
+        return self.spline.grouped(self.cell)
 
     @cached_property
     def strain_shapes(self) -> Array:
@@ -165,14 +160,13 @@ def _nominal_control(pattern: Pattern, spline: Spline) -> Array:
     level = (slopes[..., None] * pattern.normal[near][:, None, None]).reshape(len(near), 2, CELL)
     rows = np.concatenate([place, level], axis=1)
     value = np.pad(pattern.center_mm[near], ((0, 0), (0, 2)))
-    cells = np.zeros((spline.cells, CELL, CELL))
+    both = np.concatenate([np.concatenate([rows, value[..., None]], axis=2), np.zeros((1, 5, CELL + 1))])[spline.grouped(cell)]
+    both = both.reshape(spline.cells, -1, CELL + 1)
+    product = np.swapaxes(both[..., :CELL], 1, 2) @ both
     third = by_unknowns(spline.at_middle[1] * THIRD_WEIGHT[:, None]).reshape(-1, CELL)
-    cells += NOMINAL_SMOOTH * spline.knot**2 * (third.T @ third)
-    right = np.zeros((spline.cells, CELL, 1))
-    np.add.at(cells, cell, np.swapaxes(rows, 1, 2) @ rows)
-    np.add.at(right, cell, np.swapaxes(rows, 1, 2) @ value[..., None])
+    cells = product[..., :CELL] + NOMINAL_SMOOTH * spline.knot**2 * (third.T @ third)
     matrix = spline.assembled(cells, NOMINAL_RIDGE)
-    return spline.control_points(factor(matrix).solve(spline.gathered(right))[:, 0])
+    return spline.control_points(factor(matrix).solve(spline.gathered(product[..., CELL:]))[:, 0])
 
 
 def seen(terms: Terms, control_mm: Array, spread_mm: float) -> Seen:
