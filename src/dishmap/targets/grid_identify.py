@@ -213,7 +213,8 @@ def _ambiguous(search: GridSearch, ways: Ways, hint: Hint) -> IdentityError:
 
 def _listing(search: GridSearch, ways: Ways) -> str:
     """Ways in words: the turn, and which columns and rows are in view."""
-    rolls = np.degrees(search.rolls_rad(ways))
+    # whole degrees, and no minus before a zero
+    rolls = np.rint(np.degrees(search.rolls_rad(ways))) + 0.0
     texts = []
     for way in np.lexsort((ways.shift[:, 1], ways.shift[:, 0], rolls))[:LISTED_WAYS]:
         at = ways.lattice(int(way), search.lattice)
