@@ -74,9 +74,8 @@ class Bench:
 
     @property
     def rim_mm(self) -> float:
-        """Radius of the rim."""
-        assert self.pattern.surface.diameter_mm is not None
-        return self.pattern.surface.diameter_mm / 2
+        """Radius of the rim, or of the outermost ink."""
+        return self.pattern.rim_radius_mm
 
 
 def bench(name: str, camera: Camera, pattern: Pattern, distance_mm: float) -> Bench:

@@ -18,6 +18,7 @@ from dishmap.difference.model import WAYS, columns_of, smooth_kernel, surfaces_o
 from dishmap.difference.response import pose_response
 from dishmap.errors import InputError
 from dishmap.targets.bound import pattern_information
+from dishmap.targets.grid_bound import grid_information
 from dishmap.targets.pattern import Pattern
 from dishmap.targets.stages import Assumptions
 from dishmap.transforms import Pose
@@ -31,17 +32,25 @@ NORMAL_SIGMA_RAD = np.radians(2.0)
 def change_information(
     camera: Camera, pattern: Pattern, index: NDArray[np.int64], camera_from_dish: Pose, contrast_to_noise: float, psf_sigma_px: float
 ) -> Array:
-    """Fisher information (N, 6, 6) of two equal photographs on the change of each target, its own pose and ink spread unknown."""
-    one = pattern_information(camera, pattern, index, camera_from_dish, contrast_to_noise, psf_sigma_px)
+    """Fisher information (N, 6, 6) of two equal photographs on the change of each target, its own pose and ink spread unknown.
+
+    Raises MeasurementError for a grid of which `index` holds no neighbours in two directions.
+    """
+    of_one = grid_information if pattern.is_grid else pattern_information
+    one = of_one(camera, pattern, index, camera_from_dish, contrast_to_noise, psf_sigma_px)
     return information_of_two(pattern, index, one, NORMAL_SIGMA_RAD, Assumptions())
 
 
 def information_of_two(pattern: Pattern, index: NDArray[np.int64], one: Array, normal_sigma_rad: float, assumptions: Assumptions) -> Array:
-    """`change_information` from that of one photograph (N, 7, 7); normal_sigma_rad: what is known of normals beforehand."""
-    largest = np.array([pattern.kind_of(int(i)).radius_mm.max() for i in index])
+    """`change_information` from that of one photograph (N, 7, 7); normal_sigma_rad: what is known of normals beforehand.
+
+    Targets of grids have no priors of their own, as in `targets.grid_poses`.
+    """
     prior = np.zeros((len(index), 7))
-    prior[:, 3:5] = normal_sigma_rad**-2.0
-    prior[:, 6] = (assumptions.ink_spread_fraction * largest) ** -2.0
+    if not pattern.is_grid:
+        largest = np.array([pattern.kind_of(int(i)).radius_mm.max() for i in index])
+        prior[:, 3:5] = normal_sigma_rad**-2.0
+        prior[:, 6] = (assumptions.ink_spread_fraction * largest) ** -2.0
     return changed_information(one, one, prior)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, cholesky
 
+from dishmap.difference.changes import LEAST_SHARE
 from dishmap.difference.model import BLOCKS, LOCAL, Columns
 
 Array = NDArray[Any]
@@ -24,6 +25,7 @@ LOOSE_MM, LOOSE_RAD, LOOSE_STRAIN = 10.0, 0.1, 2e-3
 # How well targets on rigid parts keep their place on them.
 STILL_MM = 1e-3
 # Added to information that may be singular, as that on the turn of a lone ring: far below that of any photograph (per mm^2, per rad^2).
+# On top comes LEAST_SHARE of what the pixels show best, below which there is only rounding.
 LEAST_INFORMATION = 1e-9
 
 
@@ -277,7 +279,8 @@ def misfit(evidence: Evidence, at: Posterior) -> Array:
     scaled = evidence.columns.local * half[:, None]
     inner = np.eye(LOCAL) + np.swapaxes(scaled, 1, 2) @ evidence.information @ scaled
     pull = np.einsum("nij,ni->nj", scaled, left)
-    regular = evidence.information + LEAST_INFORMATION * np.eye(LOCAL)
+    least = LEAST_INFORMATION + LEAST_SHARE * np.diagonal(evidence.information, axis1=1, axis2=2).max(axis=1)
+    regular = evidence.information + least[:, None, None] * np.eye(LOCAL)
     whole = np.einsum("ni,ni->n", left, np.linalg.solve(regular, left[..., None])[..., 0])
     return np.asarray(whole - np.einsum("ni,ni->n", pull, np.linalg.solve(inner, pull[..., None])[..., 0]))
 

@@ -1,5 +1,6 @@
 """The Cramer-Rao bound of a grid's nodes in the image: what no unbiased fit can beat for given contrast, noise and blur.
 
+`grid_information` says what it means for places, turns and the ink's spread, of targets where the undeformed pattern lies.
 It comes from the same model and pixels as the fit: white noise, and light, widths and blur unknown at every node. Directions and curvatures
 of lines count as known, as they are but for a few per cent where neighbours are seen.
 """
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dishmap.camera.model import Camera
 from dishmap.errors import InputError, MeasurementError
 from dishmap.targets.bound import PIXEL_VARIANCE_PX2
 from dishmap.targets.grid_arms import clear_of_ends
@@ -18,9 +20,12 @@ from dishmap.targets.grid_fit import BEND, BLUR, HALF, HELD, INNER, LIGHT, NESTE
 from dishmap.targets.grid_outcome import information_of, measured_vector
 from dishmap.targets.grid_pixels import node_pixels
 from dishmap.targets.grid_shapes import node_shapes
+from dishmap.targets.grid_sheet import by_own_motion
 from dishmap.targets.grid_stages import FULL_AT_ONCE, REACH_BLURS, REACH_EXTRA_PX, chunks
+from dishmap.targets.grid_terms import CORNERS, MEASURED
 from dishmap.targets.lattice_map import lattice_maps
 from dishmap.targets.pattern import Pattern
+from dishmap.transforms import Pose
 
 Array = NDArray[Any]
 Index = NDArray[np.int64]
@@ -72,6 +77,28 @@ def grid_bound(
         out[rows] = information_of(normal, prior, by_x)
     out[~(maps.known & np.isfinite(out).all(axis=(1, 2)))] = 0.0
     return out
+
+
+def grid_information(
+    camera: Camera, pattern: Pattern, index: Index, camera_from_dish: Pose, contrast_to_noise: float, psf_sigma_px: float
+) -> Array:
+    """Fisher information (K, 7, 7) of one photograph on (move along camera axes in mm, turn about target axes in rad, edge offset in mm).
+
+    Of targets `index` (K,) of a grid, each on its own, where the undeformed pattern lies: `grid_bound` carried by what each of the seven
+    does to the measured vector, as the measurement itself has it. Crossings show two of them. Raises what `grid_bound` raises.
+    """
+    place, rotation = camera_from_dish.apply(pattern.center_mm[index]), camera_from_dish.rotation @ pattern.axes[index]
+    size = camera.width_px, camera.height_px
+    seen = grid_bound(pattern, index, camera.project(place), size, contrast_to_noise, psf_sigma_px)
+    corner, spread = None, np.zeros((len(index), seen.shape[1], 1))
+    if not pattern.lines:
+        half = np.array([np.abs(pattern.kind_of(int(i)).polygons[0].corners_mm).max() for i in index])
+        outward = CORNERS @ np.swapaxes(rotation[..., :2], 1, 2)
+        corner = half[:, None, None] * outward
+        _, by_point = camera.project_with_point_jacobian(place[:, None] + corner)
+        spread = (MEASURED @ (by_point @ outward[..., None])[..., 0]).reshape(len(index), 6, 1)
+    by = np.concatenate([*by_own_motion(camera, place, rotation, corner), spread], axis=2)
+    return np.asarray(np.swapaxes(by, 1, 2) @ seen @ by)
 
 
 def _precision(size: int) -> Array:

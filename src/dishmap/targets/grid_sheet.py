@@ -166,16 +166,26 @@ def outcome(terms: Terms, state: State, system: System, sizes: Sizes, used: Flag
 
 
 def _by_own_motion(terms: Terms, place: Array, tangent: Array, spread_mm: float) -> tuple[Array, Array]:
-    """Change (N, m, 3) of what is measured of each target by its own moves along the camera's axes, and by turns about its own axes."""
-    if not terms.squares:
-        _, by_point = terms.camera.project_with_point_jacobian(place)
+    """`by_own_motion` of targets with tangents (N, 3, 2) whose edges lie `spread_mm` outside their printed place."""
+    corner = None
+    if terms.squares:
+        corner = (tangent @ np.swapaxes((terms.half_mm + spread_mm)[:, None, None] * terms.nominal.offset, 1, 2)).swapaxes(1, 2)
+    return by_own_motion(terms.camera, place, target_axes(tangent), corner)
+
+
+def by_own_motion(camera: Camera, place_mm: Array, rotation: Array, corner_mm: Array | None) -> tuple[Array, Array]:
+    """Change (N, m, 3) of what is measured of each target by its own moves along the camera's axes, and by turns about its own axes.
+
+    place_mm (N, 3) in the camera frame, rotation (N, 3, 3) camera_from_target; corner_mm (N, 4, 3): corners of squares from their middles,
+    in camera axes; None for crossings, whose turns do not show.
+    """
+    if corner_mm is None:
+        _, by_point = camera.project_with_point_jacobian(place_mm)
         return by_point, np.zeros_like(by_point)
-    axes = target_axes(tangent)
-    corner = (tangent @ np.swapaxes((terms.half_mm + spread_mm)[:, None, None] * terms.nominal.offset, 1, 2)).swapaxes(1, 2)
-    _, by_point = terms.camera.project_with_point_jacobian(place[:, None] + corner)
-    turns = np.cross(np.swapaxes(axes, 1, 2)[:, None], corner[:, :, None])
+    _, by_point = camera.project_with_point_jacobian(place_mm[:, None] + corner_mm)
+    turns = np.cross(np.swapaxes(rotation, 1, 2)[:, None], corner_mm[:, :, None])
     both = (
-        np.einsum("mk,nkij->nmij", MEASURED, rows).reshape(len(place), 6, 3) for rows in (by_point, by_point @ np.swapaxes(turns, 2, 3))
+        np.einsum("mk,nkij->nmij", MEASURED, rows).reshape(len(place_mm), 6, 3) for rows in (by_point, by_point @ np.swapaxes(turns, 2, 3))
     )
     return tuple(both)
 
