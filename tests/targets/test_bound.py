@@ -26,6 +26,8 @@ DESIGN_PART = 0.2
 KNOWN_RAD = 1e-4
 # Claimed sigmas come from residuals: a target of 600 pixels knows its noise to 3 %.
 CLAIMED_PART = 0.10
+# What the priors still say at a contrast of 400 times the noise.
+PRIOR_PART = 0.02
 DISTANCE_MM = 1000.0
 CAMERA = Camera(400, 300, [3000.0, 3000.0], [199.5, 149.5])
 
@@ -61,6 +63,14 @@ def test_center_of_a_facing_ring_is_the_closed_form(psf_px: float, outer_px: flo
     np.testing.assert_allclose(center_sigma_px(bound), expected, rtol=CLOSED_FORM_PART)
     # no bound is below what light that is known would give
     assert (center_sigma_px(bound) > 0.99 * expected).all()
+
+
+@pytest.mark.parametrize("kind", [ring(2.4, 1.4), multi_circular(4, 2.4, 1.4, 6.8)], ids=["ring", "four rings"])
+def test_bounds_shrink_with_the_noise_down_to_none(kind: TargetKind) -> None:
+    """Face on, what tells ink spread from blooming is the priors alone, a millionth of the information of a clean photograph."""
+    some, clean = (target_bound(CAMERA, kind, facing(), contrast, 1.2) for contrast in (400.0, 40_000.0))
+    np.testing.assert_allclose(100 * center_sigma_px(clean), center_sigma_px(some), rtol=PRIOR_PART)
+    np.testing.assert_allclose(100 * clean.depth_mm, some.depth_mm, rtol=PRIOR_PART)
 
 
 def test_the_design_page_example() -> None:

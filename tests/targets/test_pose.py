@@ -96,6 +96,28 @@ def test_exact_without_noise(view: str, kind: str, radius_px: float, tilt_deg: f
     assert found.poses.blur_px[0] == pytest.approx(np.hypot(psf_px, 12**-0.5), rel=0.01)
 
 
+@pytest.mark.parametrize(("kind_name", "tilt_deg"), [*((kind, tilt) for kind in KINDS for tilt in (0.0, 2.0)), ("disc", 0.0)])
+def test_no_clean_photograph_is_refused(kind_name: str, tilt_deg: float) -> None:
+    """Face on, pixels do not tell the edge offsets apart; with next to no noise the priors that do are a millionth of the information.
+
+    The rounding of its sums must not decide whether a target is measured, wherever it lies on the pixels.
+    """
+    camera, pixel, focal_px = VIEWS["axis"]
+    rng = np.random.default_rng(17)
+    for _ in range(6):
+        radius_px, psf_px, (du, dv), turn_rad = rng.uniform(6.5, 7.5), rng.uniform(1.0, 1.4), rng.uniform(-1, 1, 2), rng.uniform(0, 6)
+        radius_mm = radius_px * DISTANCE_MM / focal_px
+        kind = disc(radius_mm) if kind_name == "disc" else KINDS[kind_name](radius_mm)
+        pose = facing_towards(camera, (pixel[0] + du, pixel[1] + dv), DISTANCE_MM, np.radians(tilt_deg), turn_rad)
+        scene = noiseless(one_target(kind), camera, pose, psf_px)
+        found = measured(replace(scene, sensor=replace(scene.sensor, noise_grey=TINY_NOISE_GREY)), rng)
+        assert len(found.poses) == 1, f"{radius_px} px, blur {psf_px}: {found.poses.rejected}"
+        assert np.linalg.norm(found.center_error_px[0]) < EXACT_PX
+        if kind_name == "disc":
+            # its depth is as uncertain as its ink, however clean the photograph
+            assert found.sigma_depth_mm[0] > 0.01 * DISTANCE_MM
+
+
 @pytest.mark.parametrize(
     ("view", "kind", "radius_px", "tilt_deg", "psf_px"),
     [

@@ -20,8 +20,8 @@ from dishmap.targets.edges import Poses
 from dishmap.targets.light import light_columns
 from dishmap.targets.neighbours import Ink, clear_of_neighbours
 from dishmap.targets.pattern import Pattern, TargetKind
-from dishmap.targets.pixels import RingSums, State, coverage_columns, rings_of, without_light
-from dishmap.targets.solve import inverse_scaled
+from dishmap.targets.pixels import ALIKE, RingSums, State, coverage_columns, rings_of, without_light
+from dishmap.targets.solve import inverse_scaled, products
 from dishmap.targets.stages import FIRST_LOG_BLUR_SIGMA, GROUP_SIZE, Assumptions, Group, layout, printed_ink
 from dishmap.targets.start import centers_of, nominal_poses
 from dishmap.transforms import Pose
@@ -174,7 +174,7 @@ def group_information(group: Group, contrast_to_noise: float, ink: Ink | None = 
     rows = slice(0, len(pixels.ring))
     cover, geometry, _ = coverage_columns(rows, pixels, batch.rings, maps, group.state)
     every = np.concatenate([-geometry, light_columns(pixels.s, pixels.t, cover)], axis=1) * pixels.used[:, None]
-    normal = (every @ np.swapaxes(every, 1, 2)).astype(float)
+    normal = products(every, ALIKE)
     empty = np.zeros(len(normal))
     sums = RingSums(normal, np.zeros(normal.shape[:2]), empty, empty, empty, empty)
     return by_target(without_light(sums)[0], pixels.target, len(group.poses)) * contrast_to_noise**2

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dishmap.targets.solve import solve_each
+from dishmap.targets.solve import products, solve_each
 
 Array = NDArray[Any]
 Single = NDArray[Any]
@@ -64,7 +64,7 @@ def solve_light(weighted: Single) -> Array:
 
     weighted (M, L + 1, n): the columns of `light_columns` and the grey levels, times the roots of the weights.
     """
-    sums = (weighted @ np.swapaxes(weighted, 1, 2)).astype(float)
+    sums = products(weighted)
     normal = sums[:, :LIGHT, :LIGHT]
     normal[:, range(LIGHT), range(LIGHT)] += ridge(normal)
     return solve_each(normal, sums[:, :LIGHT, LIGHT:])[..., 0]

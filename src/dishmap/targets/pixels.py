@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from dishmap.targets.edges import MOTION_TERMS, LocalMaps, Patches, edge_distance, monomials
 from dishmap.targets.light import GROUND, INK, LIGHT, TINY, dark_over_light, light_and_weights, light_columns, ridge, toned
 from dishmap.targets.pattern import TargetKind
-from dishmap.targets.solve import solve_each
+from dishmap.targets.solve import products, solve_each
 
 Array = NDArray[Any]
 Single = NDArray[Any]
@@ -34,7 +34,10 @@ Part = tuple[slice, int, Bool]
 
 # Geometry parameters of a target: 3 moves (mm), 3 turns (rad), edge offset (mm), edge offset (px), blur s (px), log gamma.
 GEOMETRY = 10
-OFFSET_MM, OFFSET_PX, BLUR, TONE = 6, 7, 8, 9
+ALONG, OFFSET_MM, OFFSET_PX, BLUR, TONE = 2, 6, 7, 8, 9
+# What pixels may hardly tell apart: ink that lies outwards by some px or by some mm, where a target faces the camera; for a disc both from
+# a move along the line of sight.
+ALIKE = (OFFSET_PX, ALONG, OFFSET_MM)
 # Half width of the band of pixels used, in blurs: beyond it the edge changes the pixel by under 0.2 % of the contrast.
 BAND_BLURS, BAND_EXTRA_PX = 2.5, 0.5
 # Above this product of curvature and blur the series for curved edges leaves more than 0.001 px; see tests.
@@ -410,7 +413,7 @@ def _sums(rows: slice, pixels: RingPixels, rings: Rings, maps: LocalMaps, state:
     geometry[:, :TONE] *= contrast[:, None]
     every[:, -1] = residual
     every[:, GEOMETRY:] *= root[:, None]
-    sums = (every @ np.swapaxes(every, 1, 2)).astype(float)
+    sums = products(every, ALIKE)
     kept = np.ones(edges.shape[:2])
     if robust is not used:
         whole = (edges @ used[..., None])[..., 0]

@@ -1,13 +1,41 @@
-"""Many small linear systems at once, of which any may be singular: that one gets no answer, the others theirs."""
+"""Many small linear systems at once, made from columns and solved; any may be singular: that one gets no answer, the others theirs."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
+# Of a square in single precision: smaller ones are nothing.
+LEAST_SQUARE = 1e-30
+
+
+def products(columns: NDArray[Any], alike: Sequence[int] = ()) -> Array:
+    """Products (M, K, K) of columns (M, K, n) with each other, in single precision but for columns that are nearly multiples of each other.
+
+    What tells such columns apart, data or a prior, may be less than the rounding of their products, and the normal matrix then not be
+    positive. So of those numbered `alike` each is set apart from the ones before it (modified Gram-Schmidt, in place: `columns` are not to
+    be used afterwards), and the products are put together again in double precision.
+    """
+    taken = []
+    for place, later in enumerate(alike):
+        for first in alike[:place]:
+            one, other = columns[:, first], columns[:, later]
+            factor = np.einsum("mn,mn->m", one, other) / np.maximum(np.einsum("mn,mn->m", one, one), LEAST_SQUARE)
+            other -= factor[:, None] * one
+            taken.append((later, first, factor[:, None].astype(float)))
+    out = np.empty((len(columns), columns.shape[1], columns.shape[1]))
+    # not a product of one array with itself, for which a routine is called that is several times slower on small matrices
+    out[:, :-1] = columns[:, :-1] @ np.swapaxes(columns, 1, 2)
+    out[:, -1, :-1] = out[:, :-1, -1]
+    out[:, -1, -1] = np.einsum("mn,mn->m", columns[:, -1], columns[:, -1])
+    for later, first, factor in reversed(taken):
+        out[:, later] += factor * out[:, first]
+        out[:, :, later] += factor * out[:, :, first]
+    return out
 
 
 def solve_each(matrix: Array, right: Array) -> Array:
