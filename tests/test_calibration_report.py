@@ -13,6 +13,7 @@ import pytest
 
 from dishmap.calibration_report import Checks, calibration_report, headline, remarks_on
 from dishmap.camera.advice import suggestions
+from dishmap.camera.board import SHAPE_TERMS
 from dishmap.camera.calibrate import Calibration, calibrate
 from dishmap.camera.compare_cameras import halves_of
 from dishmap.camera.lens_choice import choose_lens
@@ -100,7 +101,7 @@ def test_photographs_without_a_board_are_named_on_the_page() -> None:
 
 def test_a_bent_board_and_lost_corners_are_said() -> None:
     calibration, checks = made()
-    bent = replace(calibration.board, shape_mm=np.array([1.0, 0.0, 0.0, 0.0, 0.0]), covariance_mm2=np.eye(5) * 1e-4)
+    bent = replace(calibration.board, shape_mm=np.eye(len(SHAPE_TERMS))[0], covariance_mm2=np.eye(len(SHAPE_TERMS)) * 1e-4)
     used = (np.arange(88) > 5, *calibration.used[1:])
     said = " ".join(remarks_on(replace(calibration, board=bent, used=used), checks))
     assert "The board is not flat, by 1.00 mm" in said

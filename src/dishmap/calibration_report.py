@@ -291,7 +291,9 @@ def _board(calibration: Calibration) -> str:
         return section("Board", paragraph("The board was taken as flat and printed exactly."))
     sigmas = np.sqrt(np.diag(board.covariance_mm2))
     rows = [
-        (name, f"{size:.4f}", number(float(sigma)), "mm") for name, size, sigma in zip(SHAPE_TERMS, board.shape_mm, sigmas, strict=True)
+        (name, f"{size:.4f}", number(float(sigma)), "mm")
+        for name, size, sigma in zip(SHAPE_TERMS, board.shape_mm, sigmas, strict=True)
+        if sigma > 0
     ]
     about = (
         f"Height over a plane at {number(board.half_mm)} mm from the board's middle, along its x and y, positive away from the camera for "

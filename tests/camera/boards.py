@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dishmap.camera.board import BENDS, SHAPE_TERMS, STRETCHES, BoardView, shapes_of
+from dishmap.camera.board import BENDS, CURVES, SHAPE_TERMS, STRETCHES, BoardView, shapes_of
 from dishmap.camera.chessboard import chessboard_mm
 from dishmap.camera.model import Camera
 from dishmap.simulate.render import simulate
@@ -62,19 +62,26 @@ def corner_views(
     stretch_mm: float = 0.0,
     print_mm: float = 0.0,
     motion_mm: float = 0.0,
+    curve_mm: float = 0.0,
+    tilt_rad: float = 0.6,
 ) -> list[BoardView]:
     """Views of a chessboard with noise on its corners.
 
     Sigmas of what is wrong with the board, the same in all views: bend_mm of each of its bends, stretch_mm of stretch and skew, print_mm
-    of each printed point. motion_mm: sigma of the board's shift and turn (at half its side) while the rows of a picture are read.
+    of each printed point, curve_mm of each curve of the print.
+    motion_mm: sigma of the board's shift and turn (at half its side) while the rows of a picture are read.
+    tilt_rad: of boards about two axes, at most.
     """
     middle, half = CORNERS.mean(axis=0), float(np.ptp(CORNERS, axis=0).max()) / 2
     printed = CORNERS - middle
-    terms = rng.normal(size=len(SHAPE_TERMS)) * ([bend_mm] * len(BENDS) + [stretch_mm] * len(STRETCHES))
+    terms = np.zeros(len(SHAPE_TERMS))
+    terms[: -len(CURVES)] = rng.normal(size=len(BENDS) + len(STRETCHES)) * ([bend_mm] * len(BENDS) + [stretch_mm] * len(STRETCHES))
+    if curve_mm:
+        terms[-len(CURVES) :] = rng.normal(size=len(CURVES)) * curve_mm
     printed += shapes_of(printed, np.zeros(2), half) @ terms
     if print_mm:
         printed[:, :2] += rng.normal(size=(len(CORNERS), 2)) * print_mm
-    poses = poses_in_view(rng, camera, printed, count)
+    poses = poses_in_view(rng, camera, printed, count, tilt_rad)
     pixels = [moving_corners(camera, pose, printed, rng.normal(size=6) * motion_mm / ([half] * 3 + [1.0] * 3)) for pose in poses]
     return [BoardView(f"{k}", seen + rng.normal(size=seen.shape) * noise_px, CORNERS) for k, seen in enumerate(pixels)]
 

@@ -22,7 +22,14 @@ Array = NDArray[np.float64]
 BENDS = {"bow_x": (2, 0), "twist": (1, 1), "bow_y": (0, 2)}
 # Terms in the plane: x longer and y shorter, and the right angle lost. How large all of it is printed, no photograph can tell.
 STRETCHES = ("stretch", "skew")
-SHAPE_TERMS = (*BENDS, *STRETCHES)
+# Lines of the print that curve, and squares that grow from side to side: x^i y^j along x, and along y. Seen from nearly one side they look
+# like perspective.
+CURVES = {
+    f"curve_{along}_{term}": (axis, powers)
+    for axis, along in enumerate("xy")
+    for term, powers in (("xx", (2, 0)), ("xy", (1, 1)), ("yy", (0, 2)))
+}
+SHAPE_TERMS = (*BENDS, *STRETCHES, *CURVES)
 # A circle's outline is followed through the lens at so many points: its centre is then right to 1e-5 of its radius.
 OUTLINE_POINTS = 24
 
@@ -93,13 +100,16 @@ def bends_of(board_mm: Array, middle_mm: Array, half_mm: float) -> Array:
 def shapes_of(board_mm: Array, middle_mm: Array, half_mm: float) -> Array:
     """How far points board_mm (N, 3) move for each term of SHAPE_TERMS of size 1 mm (N, 3, F): heights by `bends_of`, then in the plane.
 
-    A stretch of size b mm makes the half side longer by b along x and shorter along y; a skew moves the end of the half side by b sideways.
+    A stretch of size b mm makes the half side longer by b along x and shorter along y; a skew moves the end of the half side by b sideways;
+    a curve moves the ends by b over the middle.
     """
     out = np.zeros((len(board_mm), 3, len(SHAPE_TERMS)))
     out[:, 2, : len(BENDS)] = bends_of(board_mm, middle_mm, half_mm)
     x, y = ((board_mm[:, :2] - middle_mm) / half_mm).T
     out[:, :2, len(BENDS)] = np.stack([x, -y], axis=-1)
     out[:, :2, len(BENDS) + 1] = np.stack([y, x], axis=-1)
+    for k, (axis, (i, j)) in enumerate(CURVES.values(), start=len(BENDS) + len(STRETCHES)):
+        out[:, axis, k] = x**i * y**j
     return out
 
 
@@ -148,6 +158,11 @@ class BoardShape:
     print_mm: Array
     print_sigma_mm: float = 0.0
     free: bool = True
+
+    @property
+    def curved(self) -> bool:
+        """Whether curves of the print were estimated."""
+        return bool(self.covariance_mm2[-1, -1] > 0)
 
     @property
     def bend_mm(self) -> Array:

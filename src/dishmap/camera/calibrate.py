@@ -44,7 +44,8 @@ FEWEST_CORNERS = 12
 FLATNESS = 0.1
 # Focal lengths tried for the start, in units of the longer side: from 120 degrees across to a long lens.
 START_FOCAL = {"opencv": np.geomspace(0.3, 20.0, 11), "fisheye": np.geomspace(0.2, 3.0, 8)}
-# Views must show the board in directions that differ by this much, or focal length and distance cannot be told apart.
+# Views must show the board in directions that differ by this much, or focal length and distance cannot be told apart. Where they differ
+# by less than WEAK_TURN_RAD curves of the print look like perspective, and are estimated, so that sigmas know of them.
 SMALLEST_TURN_RAD = np.radians(3.0)
 WEAK_TURN_RAD = np.radians(15.0)
 # Beyond this part of the focal length the sigma of focal length or principal point makes a camera useless. The noise is
@@ -116,7 +117,7 @@ class Calibration:
         """The least-squares problem that this calibration solves."""
         size, board = (self.camera.width_px, self.camera.height_px), self.board
         frame = (board.middle_mm, board.half_mm, board.points_mm, self.expected, not board.free, self.readout)
-        return Problem(self.views, size, *frame, self.sigma_px, board.print_sigma_mm, self.motion_sigma_mm)
+        return Problem(self.views, size, *frame, self.sigma_px, board.print_sigma_mm, self.motion_sigma_mm, board.curved)
 
     @property
     def bundle(self) -> Bundle:
@@ -155,6 +156,7 @@ def calibrate(
     first[[0, 1, 4, 5]] = True  # first what bends most: focal lengths and two radial terms
     for free in (first, problem.free(bundle)):
         bundle = problem.solve(bundle, free=free, robust=True)
+    problem = replace(problem, curved=largest_turn_rad(bundle) < WEAK_TURN_RAD)
     return _result(*_learnt(*screened(problem, bundle)), lens)
 
 
@@ -221,7 +223,8 @@ def _result(problem: Problem, bundle: Bundle, used: tuple[Mask, ...], weight: Ar
     parts = [residuals[s] for s in corners.slices]
     coverage = _coverage(bundle.camera, corners.pixels[good])
     count, terms = len(bundle.camera.parameters), len(SHAPE_TERMS)
-    shape = np.zeros((terms, terms)) if problem.flat else covariance[count:, count:]
+    shape = np.zeros((terms, terms))
+    shape[np.ix_(free[count:], free[count:])] = covariance[count:, count:]
     return Calibration(
         camera=replace(bundle.camera, covariance=covariance[:count, :count]),
         views=problem.views,
@@ -340,7 +343,10 @@ def _notes(bundle: Bundle, coverage: float) -> tuple[str, ...]:
     if len(bundle.rotation) < WEAK_VIEWS:
         notes.append(f"only {len(bundle.rotation)} views were used; 10 to 20 make the uncertainty itself trustworthy")
     if (turn := largest_turn_rad(bundle)) < WEAK_TURN_RAD:
-        notes.append(f"the board's directions differ by {np.degrees(turn):.0f} degrees at most; 40 or more fix the focal length better")
+        notes.append(
+            f"the board's directions differ by {np.degrees(turn):.0f} degrees at most; 40 or more fix the focal length better (from nearly "
+            "one side a curved print looks like perspective)"
+        )
     if coverage < WEAK_COVERAGE:
         notes.append(f"corners cover {coverage:.0%} of the picture; the camera is extrapolated elsewhere")
     width, height = bundle.camera.width_px, bundle.camera.height_px

@@ -79,13 +79,13 @@ def choose_lens(
         if progress:
             progress(done, steps)
 
-    made, choice = _tried(views, width_px, height_px, flat, first, tell)
+    made, choice = _tried(views, width_px, height_px, flat, first, leanest, tell)
     if readout != "auto":
         return made, choice
     before = leanest or made
     # a lens that is too lean can hide motions
     if first == "global" and (second := likely_readout(made)[0]) != "global":
-        before, (made, choice) = made, _tried(views, width_px, height_px, flat, second, lambda done: tell(len(CANDIDATES) + done))
+        before, (made, choice) = made, _tried(views, width_px, height_px, flat, second, leanest, lambda done: tell(len(CANDIDATES) + done))
     tell(steps)
     return made, replace(choice, readout_reason=_why_readout(made, before))
 
@@ -102,16 +102,23 @@ def _why_readout(made: Calibration, before: Calibration) -> str:
 
 
 def _tried(
-    views: Sequence[BoardView], width_px: int, height_px: int, flat: bool, readout: str, tell: Callable[[int], None]
+    views: Sequence[BoardView],
+    width_px: int,
+    height_px: int,
+    flat: bool,
+    readout: str,
+    leanest: Calibration | None,
+    tell: Callable[[int], None],
 ) -> tuple[Calibration, LensChoice]:
-    """Every lens model with one readout."""
+    """Every lens model with one readout; leanest: that of the leanest, where it was made before."""
     made: dict[str, Calibration] = {}
     problems: dict[str, MeasurementError | CameraError] = {}
     errors: dict[str, Array] = {}
 
     def tried(lens: str) -> tuple[Calibration, Array] | MeasurementError | CameraError:
         try:
-            calibration = calibrate(views, width_px, height_px, lens, flat, readout)
+            known = leanest is not None and (leanest.lens, leanest.readout) == (lens, readout)
+            calibration = leanest if leanest and known else calibrate(views, width_px, height_px, lens, flat, readout)
             return calibration, held_out_errors(calibration, [view.name for view in views])
         except (MeasurementError, CameraError) as error:
             return error

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.camera import adjustment as ba
-from dishmap.camera.board import BENDS, SHAPE_TERMS, STRETCHES, BoardView, board_frame, outline_shift, point_index, shapes_of
+from dishmap.camera.board import BENDS, CURVES, SHAPE_TERMS, STRETCHES, BoardView, board_frame, outline_shift, point_index, shapes_of
 from dishmap.camera.bundle import BoardCorners, Bundle, Prior
 from dishmap.camera.model import Camera
 
@@ -19,8 +19,8 @@ Mask = NDArray[np.bool_]
 
 # A sheet on a plate bows by less than this part of its half side (sigma): 1 mm on a board of 200 mm.
 BEND_PART = 0.01
-# Printers stretch one side against the other by some parts in a thousand.
-STRETCH_PART = 0.002
+# Printers stretch one side against the other by some parts in a thousand, and rollers that slip and worn paper paths curve lines as much.
+STRETCH_PART = CURVE_PART = 0.002
 # How a picture is read: all at once, or line by line.
 READOUTS = ("global", "rows", "columns")
 # Centres of outlines follow the camera; this many rounds bring them to rest, or a change below this many px.
@@ -35,7 +35,7 @@ class Problem:
     expected (P,): camera parameters that the prior is about; flat: the board is taken as exact; readout: one of READOUTS. noise_px:
     sigma of a
     measured coordinate, taken from the residuals where it is 0; print_mm, motion_mm: how far a printed point is off (sigma), and how far
-    the board moves while a picture is read; 0 where that is not estimated.
+    the board moves while a picture is read; 0 where that is not estimated. curved: whether curves of the print are estimated too.
     """
 
     views: tuple[BoardView, ...]
@@ -49,6 +49,7 @@ class Problem:
     noise_px: float = 0.0
     print_mm: float = 0.0
     motion_mm: float = 0.0
+    curved: bool = False
 
     def of_views(self, views: Sequence[BoardView]) -> Problem:
         """The same problem with other views."""
@@ -102,7 +103,9 @@ class Problem:
     def free(self, bundle: Bundle, camera: bool = True) -> Mask:
         """Which shared parameters are estimated: all, or none of a known camera and board; no shape of an exact board."""
         count = len(bundle.camera.parameters)
-        return np.concatenate([np.full(count, camera), np.full(len(SHAPE_TERMS), camera and not self.flat)])
+        shape = np.full(len(SHAPE_TERMS), camera and not self.flat)
+        shape[-len(CURVES) :] &= self.curved
+        return np.concatenate([np.full(count, camera), shape])
 
     def prior(self, bundle: Bundle, corners: BoardCorners, weights: Array | None = None) -> Prior:
         """What is known before, weighed against the noise that the residuals show."""
@@ -114,7 +117,7 @@ class Problem:
             if self.noise_px
             else ba.scale_px(residuals if weights is None else residuals[weights > 0])
         )
-        shape = self.half_mm * np.array([BEND_PART] * len(BENDS) + [STRETCH_PART] * len(STRETCHES))
+        shape = self.half_mm * np.array([BEND_PART] * len(BENDS) + [STRETCH_PART] * len(STRETCHES) + [CURVE_PART] * len(CURVES))
         motion = self.motion_mm * np.array([1 / self.half_mm] * 3 + [1.0] * 3) if self.motion_mm else None
         return Prior(self.expected, radius, noise, shape, self.print_mm, motion)
 
