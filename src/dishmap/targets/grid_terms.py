@@ -28,6 +28,8 @@ THIRD_WEIGHT = np.sqrt([1.0, 3.0, 3.0, 1.0])
 STRAIN_WEIGHT = np.array([1.0, 1.0, np.sqrt(2.0)])
 # Degree of the smooth strains that a sheet may have besides those of single cells.
 STRAIN_DEGREE = 3
+# The part of a cell that counts as printed where nothing is.
+NOTHING_PRINTED = 1e-4
 # Fit of the nominal places, which are smooth: rounding is all that is smoothed.
 NOMINAL_SMOOTH, NOMINAL_RIDGE = 1e-6, 1e-10
 
@@ -37,13 +39,15 @@ class Nominal:
     """The nominal surface in the layout of the spline.
 
     control_mm (K, 3): control points in the dish frame; frame (cells, 4, 2, 2): T with T^T G0 T = 1 at Gauss's points; third (cells, 4):
-    n . X_kkk in the middles of cells; offset (N, 4, 2): corners of squares about their nodes in lattice steps per mm of half a side.
+    n . X_kkk in the middles of cells; offset (N, 4, 2): corners of squares about their nodes in lattice steps per mm of half a side;
+    printed (cells,): the part of each cell that the pattern fills. Where nothing is printed there is no material that could resist.
     """
 
     control_mm: Array
     frame: Array
     third: Array
     offset: Array
+    printed: Array
 
 
 @dataclass(frozen=True)
@@ -87,6 +91,7 @@ class Terms:
         pairs = [(i, j) for i in range(STRAIN_DEGREE + 1) for j in range(STRAIN_DEGREE + 1 - i)]
         value = np.stack([one[..., i] * other[..., j] * np.sqrt((2 * i + 1) * (2 * j + 1)) for i, j in pairs], axis=-1)
         alike = np.einsum("cqk,vw->cqvkw", value, np.diag(STRAIN_WEIGHT) * (0.5 * spline.knot))
+        alike = alike * np.sqrt(self.nominal.printed)[:, None, None, None, None]
         return alike.reshape(spline.cells, 12, -1)
 
 
@@ -145,7 +150,15 @@ def _nominal(pattern: Pattern, spline: Spline, rows: Index) -> Nominal:
     at = np.stack([spline.weights(cell, lattice[rows], by) for by in FIRST], axis=1) @ own[cell]
     # lattice steps per mm along the target's own axes
     steps = np.linalg.inv(np.swapaxes(at @ pattern.axes[rows][..., :2], 1, 2))
-    return Nominal(control, frame, np.einsum("cd,ckd->ck", normal, third @ own), CORNERS @ np.swapaxes(steps, 1, 2))
+    offset = CORNERS @ np.swapaxes(steps, 1, 2)
+    return Nominal(control, frame, np.einsum("cd,ckd->ck", normal, third @ own), offset, _printed(spline, lattice))
+
+
+def _printed(spline: Spline, lattice: Array) -> Array:
+    """The part (cells,) of each cell with nodes of the pattern; hardly anything where there are none, so that the rest stays in reach."""
+    inside = ((lattice > spline.low) & (lattice < spline.low + spline.knot * np.array(spline.count))).all(axis=1)
+    nodes = np.bincount(spline.cell_of(lattice[inside]), minlength=spline.cells)
+    return np.clip(nodes / spline.knot**2, NOTHING_PRINTED, 1.0)
 
 
 def _nominal_control(pattern: Pattern, spline: Spline) -> Array:
@@ -222,8 +235,8 @@ def strain_rows(terms: Terms, control_mm: Array) -> tuple[Array, Array]:
         0.5 * (along[:, :, i, :, None] * tangent[:, :, None, :, j] + along[:, :, j, :, None] * tangent[:, :, None, :, i]) for i, j in pairs
     ]
     by = np.stack(rows, axis=2).reshape(spline.cells, 4, 3, CELL)
-    scale = STRAIN_WEIGHT * (0.5 * spline.knot)
-    return (value * scale).reshape(spline.cells, 12), (by * scale[:, None]).reshape(spline.cells, 12, CELL)
+    scale = STRAIN_WEIGHT * (0.5 * spline.knot) * np.sqrt(terms.nominal.printed)[:, None, None]
+    return (value * scale).reshape(spline.cells, 12), (by * scale[..., None]).reshape(spline.cells, 12, CELL)
 
 
 def rough_rows(terms: Terms, control_mm: Array) -> tuple[Array, Array]:
@@ -233,10 +246,10 @@ def rough_rows(terms: Terms, control_mm: Array) -> tuple[Array, Array]:
     first, third = spline.at_middle
     tangent, bend = np.swapaxes(first @ own, -1, -2), third @ own
     normal = normal_of(tangent)
-    scale = THIRD_WEIGHT * spline.knot
+    scale = THIRD_WEIGHT * spline.knot * np.sqrt(terms.nominal.printed)[:, None]
     value = np.einsum("cd,ckd->ck", normal, bend) - terms.nominal.third
     # a turn of the surface turns the normal: dn = - sum over tangents of (dual tangent) (n . d tangent)
     dual = tangent @ np.linalg.inv(np.swapaxes(tangent, -1, -2) @ tangent)
     weights = third[None] - (bend @ dual) @ first
-    by = (weights * scale[:, None])[..., None] * normal[:, None, None, :]
+    by = (weights * scale[..., None])[..., None] * normal[:, None, None, :]
     return value * scale, by.reshape(spline.cells, 4, CELL)
