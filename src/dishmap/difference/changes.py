@@ -77,7 +77,8 @@ class TargetChanges:
 def combine_frames(frames: list[TargetPoses]) -> TargetPoses:
     """One measurement from several photographs of the same state by the same fixed camera.
 
-    Likelihoods multiply; the priors on normals and ink count once. Targets that only some frames show are kept. Raises
+    Likelihoods multiply; the priors on normals and ink count once. Targets that only some frames show are kept. Covariances of a grid's
+    targets become those of frames without common errors, which is what differences ask for: printing errors cancel in them. Raises
     MeasurementError for an empty list.
     """
     if not frames:
@@ -95,9 +96,10 @@ def _merged(a: TargetPoses, b: TargetPoses) -> TargetPoses:
     pull_b = b.pull[in_b] + np.einsum("nij,nj->ni", b.information[in_b], shift)
     information = a.information.copy()
     information[in_a] += b.information[in_b]
-    # the new estimate, with a's priors in force: they pull against a.pull
-    posterior = information[in_a] + _held(a.prior[in_a], information[in_a])
-    step = np.linalg.solve(posterior, pull_b[..., None])[..., 0]
+    step, moved_covariance = _balanced(select_targets(a, in_a), information[in_a], pull_b)
+    # a target of a grid is held by all others, not by priors of its own: its pixels pull on wherever it is put
+    free = _is_free(a)[in_a]
+    step[free], moved_covariance[free] = _between_both(a.covariance[in_a[free]], b.covariance[in_b[free]], shift[free])
     pull = a.pull.copy()
     pull[in_a] += pull_b - np.einsum("nij,nj->ni", information[in_a], step)
     position, rotation, offset = a.position_mm.copy(), a.rotation.copy(), a.offset_mm.copy()
@@ -105,7 +107,7 @@ def _merged(a: TargetPoses, b: TargetPoses) -> TargetPoses:
     rotation[in_a] = rotation[in_a] @ rotation_from_vector(step[:, 3:6])
     offset[in_a] += step[:, 6]
     covariance = a.covariance.copy()
-    covariance[in_a] = np.linalg.inv(posterior)[:, :6, :6]
+    covariance[in_a] = moved_covariance
     quality = a.quality.copy()
     quality[in_a] |= b.quality[in_b]
     inside = {
@@ -125,6 +127,24 @@ def _merged(a: TargetPoses, b: TargetPoses) -> TargetPoses:
     }
     order = np.argsort(columns["index"])
     return replace(a, **{name: values[order] for name, values in columns.items()})
+
+
+def _balanced(a: TargetPoses, information: Array, pull: Array) -> tuple[Array, Array]:
+    """Steps (N, 7) from estimates at the balance of pixels and priors, and covariances (N, 6, 6), once further pixels pull (N, 7).
+
+    information (N, 7, 7): of all pixels. The priors of `a` stay in force, so that its own pixels and they go on cancelling.
+    """
+    posterior = information + _held(a.prior, information)
+    return np.linalg.solve(posterior, pull[..., None])[..., 0], np.linalg.inv(posterior)[:, :6, :6]
+
+
+def _between_both(one: Array, other: Array, shift: Array) -> tuple[Array, Array]:
+    """Steps (N, 7) from one estimate towards another, a shift (N, 7) away, by their covariances (N, 6, 6), and the mean's covariance."""
+    gain = one @ np.linalg.inv(one + other)
+    step = 0.5 * shift
+    step[:, :6] = (gain @ shift[:, :6, None])[..., 0]
+    covariance = one - gain @ one
+    return step, 0.5 * (covariance + np.swapaxes(covariance, 1, 2))
 
 
 def _averaged_centers(a: TargetPoses, b: TargetPoses, in_a: Index, in_b: Index) -> dict[str, Array]:
@@ -206,7 +226,7 @@ def target_changes(reference: TargetPoses, current: TargetPoses, camera: Camera,
     turned = np.zeros((7, 7))
     turned[:3, :3], turned[3:, 3:] = moved.rotation, np.eye(4)
     after = _seen_from(aligned, after, camera)
-    information, score = _eliminated(before, after, _between(aligned, after), turned)
+    information, score = _eliminated(before, after, _between(aligned, after), _carried(before, aligned, turned))
     camera_before, _ = pose_response(camera, pattern, before.index, reference.camera_from_dish)
     camera_after, strain = pose_response(camera, pattern, before.index, moved @ reference.camera_from_dish)
     focal = -camera_after[..., :2] @ camera.parameters[:2]
@@ -225,6 +245,24 @@ def target_changes(reference: TargetPoses, current: TargetPoses, camera: Camera,
         covariance_du_dv_px2=before.covariance_px2 + after.covariance_px2,
         quality=before.quality | after.quality,
     )
+
+
+def _carried(before: TargetPoses, aligned: TargetPoses, turned: Array) -> Array:
+    """How an error of each reference pose (N, 7, 7) shows after the motion `turned` (7, 7): as that has it, but for targets of a grid.
+
+    These know their depth from all others, and their errors of depth are common: with each free on its own, the smallest turn of a line of
+    sight would make an error of depth look like a move across it. They are taken along from line of sight to line of sight.
+    """
+    out = np.tile(turned, (len(before), 1, 1))
+    free = _is_free(before)
+    here, there = (
+        p / np.linalg.norm(p, axis=1, keepdims=True) for p in (before.position_mm[free] @ turned[:3, :3].T, aligned.position_mm[free])
+    )
+    axis, cosine = np.cross(here, there), (here * there).sum(axis=1)[:, None, None]
+    cross = cross_matrix(axis)
+    # the least rotation from one direction to another
+    out[free, :3, :3] = (np.eye(3) + cross + cross @ cross / (1 + cosine)) @ turned[:3, :3]
+    return out
 
 
 def shows_place_only(information: Array) -> NDArray[np.bool_]:
@@ -262,18 +300,19 @@ def changed_information(before: Array, after: Array, prior: Array) -> Array:
     return np.asarray(0.5 * (change + np.swapaxes(change, 1, 2)))[:, :6, :6]
 
 
-def _eliminated(before: TargetPoses, after: TargetPoses, between: Array, turned: Array) -> tuple[Array, Array]:
+def _eliminated(before: TargetPoses, after: TargetPoses, between: Array, carried: Array) -> tuple[Array, Array]:
     """Information (N, 6, 6) and score (N, 6) of the change, the reference's own pose and the ink's spread eliminated.
 
-    With e the error of the reference estimate (pose and edge offset) and y = x - between that of the change, the photographs say
+    carried (N, 7, 7): how errors of the reference show after its rigid motion. With e the error of the reference estimate (pose and edge
+    offset) and y = x - between that of the change, the photographs say
     q e - e A e / 2 - (e + y) B (e + y) / 2 + p (e + y), A and B their informations (A with its priors), q and p their pulls: q is 0 where
     the reference is at its balance. Over the best e this is -y (B - B M B) y / 2 + (p - B M (p + q)) y, M = (A + B)^-1.
     """
-    a = turned @ (before.information + _held(before.prior, before.information)) @ turned.T
+    a = carried @ (before.information + _held(before.prior, before.information)) @ np.swapaxes(carried, 1, 2)
     b = after.information
     b_m = b @ np.linalg.inv(a + b)
     information = b - b_m @ b
-    own = _unbalanced(before) @ turned.T
+    own = (carried @ _unbalanced(before)[..., None])[..., 0]
     score = after.pull - np.einsum("nij,nj->ni", b_m, after.pull + own)
     # edge offsets do not change between the photographs, so the last part of y is known
     offset = -between[:, 6]
@@ -288,7 +327,12 @@ def _unbalanced(poses: TargetPoses) -> Array:
 
     Nothing where a target's own priors hold it against its pixels; the pixels where its estimate came from all targets together (a grid's).
     """
-    return np.where((poses.prior > 0).any(axis=1, keepdims=True), 0.0, poses.pull)
+    return np.where(_is_free(poses)[:, None], poses.pull, 0.0)
+
+
+def _is_free(poses: TargetPoses) -> NDArray[np.bool_]:
+    """Targets (N,) without priors of their own: a grid's."""
+    return np.asarray(~(poses.prior > 0).any(axis=1))
 
 
 def _held(prior: Array, information: Array) -> Array:
