@@ -139,11 +139,12 @@ def _motion(result: Difference, image: NDArray[np.generic] | None) -> str:
     arrows = _arrows(result)
     longest = number(float(np.hypot(*rows.du_dv_px.T).max()))
     over = "over the current photograph" if image is not None else "in the picture's frame"
+    which = "each target's centre" if len(arrows.titles) == arrows.of else f"the centres of {len(arrows.titles)} of {targets(arrows.of)}"
     size = f"{arrows.factor:g} times enlarged" if arrows.factor > 1 else "at true scale"
     first, last = arrows.frame.columns, arrows.frame.rows
     picture = figure(
-        arrows_svg(image, arrows, f"Arrows of the motion of {targets(len(rows))} in the picture, at most {longest} px."),
-        f"How each target's centre moved in the picture (du, dv), {over}, from where it was in the reference, {size}; "
+        arrows_svg(image, arrows, f"Arrows of the motion of {targets(len(arrows.titles))} in the picture, at most {longest} px."),
+        f"How {which} moved in the picture (du, dv), {over}, from the place in the reference, {size}; "
         f"the rigid motion is part of it. Columns {first[0]} to {first[1] - 1}, rows {last[0]} to {last[1] - 1}. "
         "Hovering over an arrow tells its numbers.",
     )

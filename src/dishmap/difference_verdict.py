@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +12,7 @@ from scipy.stats import chi2
 from dishmap.compare import PAPER, Difference, DifferenceTable
 from dishmap.difference.difference_map import DifferenceMap
 from dishmap.quality import MEANING, Quality, names
-from dishmap.verdict import Fact, Verdict, id_list, number, targets
+from dishmap.verdict import Fact, Verdict, common_reasons, id_list, number, targets
 
 Array = NDArray[Any]
 Bools = NDArray[np.bool_]
@@ -287,10 +286,12 @@ def _warnings(result: Difference) -> list[str]:
             "calibration does to a difference. `dishmap calibrate` writes a camera with it."
         )
     if lost := unused_targets(result):
-        reasons = Counter(reason for _, reason in lost)
-        for why, count in reasons.items():
-            each = ", for each" if count > 1 else ""
-            out.append(f"{targets(count)} not used ({id_list([i for i, r in lost if r == why])}){each}: {why}.")
+        usual, others = common_reasons(lost)
+        for why in usual:
+            ids = [i for i, r in lost if r == why]
+            out.append(f"{targets(len(ids))} not used ({id_list(ids)}){', for each' if len(ids) > 1 else ''}: {why}.")
+        if others:
+            out.append(f"{targets(len(others))} not used for other reasons ({id_list(others)}); they are listed under outliers and flags.")
     for flag in Quality:
         ids = table.ids[(table.quality & int(flag)) != 0] if flag else []
         # what was put aside is told above, with the reason

@@ -72,15 +72,13 @@ def reprojection_of(result: Map) -> Reprojection | None:
         return None
     clean = poses.quality == 0
     used = clean if clean.any() else (poses.quality & int(Quality.OUTLIER)) == 0
-    nominal = result.camera.project(result.camera_from_dish.apply(result.pattern.center_mm[poses.index[used]]))
-    rigid = float(np.sqrt(((poses.center_px[used] - nominal) ** 2).sum(axis=1).mean()))
     sheet, calibration = poses.sheet, _calibration_px(result.camera, poses.position_mm[used])
     known = {"noise": sheet.noise_rms_px, "printing": sheet.print_rms_px}
     smooth_limit = max(known, key=known.__getitem__)
     known["calibration"] = calibration if np.isfinite(calibration) else 0.0
     expected = float(np.sqrt(sum(part**2 for part in known.values())))
-    limit = "shape" if rigid > SHAPE_SHOWS * max(expected, sheet.fit_rms_px) else max(known, key=known.__getitem__)
-    return Reprojection(sheet.fit_rms_px, rigid, sheet.noise_rms_px, sheet.print_rms_px, calibration, smooth_limit, limit)
+    limit = "shape" if sheet.rigid_rms_px > SHAPE_SHOWS * max(expected, sheet.fit_rms_px) else max(known, key=known.__getitem__)
+    return Reprojection(sheet.fit_rms_px, sheet.rigid_rms_px, sheet.noise_rms_px, sheet.print_rms_px, calibration, smooth_limit, limit)
 
 
 def _calibration_px(camera: Camera, position_mm: Array) -> float:

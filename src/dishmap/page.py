@@ -19,7 +19,7 @@ h3{font-size:17px;margin:24px 0 8px}
 p{margin:8px 0;max-width:80ch}
 .verdict{border-left:6px solid #0072b2;background:#f3f7fa;padding:14px 20px;margin:18px 0;font-size:20px;font-weight:600}
 .verdict.look{border-color:#d55e00;background:#fdf5ef}
-.facts{display:grid;grid-template-columns:repeat(auto-fit,minmax(170px,1fr));gap:12px;margin:18px 0;padding:0}
+.facts{display:grid;grid-template-columns:repeat(auto-fit,minmax(205px,1fr));gap:12px;margin:18px 0;padding:0}
 .facts div{border:1px solid #d0d0d0;border-radius:6px;padding:10px 14px}
 .facts dt{font-size:13.5px;color:#505050}
 .facts dd{margin:0}

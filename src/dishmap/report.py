@@ -18,7 +18,7 @@ from dishmap.page import bullet_list, charts, fact_grid, figure, page, paragraph
 from dishmap.pipeline import Map
 from dishmap.plot.maps import normals_map, ratio_histogram, residual_map, sigma_map
 from dishmap.plot.outlines import check_picture, outlines_of, unused_outlines
-from dishmap.plot.photograph import error_svg, photograph_frame, photograph_svg
+from dishmap.plot.photograph import error_svg, photograph_frame, photograph_svg, shows_ids
 from dishmap.plot.scene import exaggeration, scene_of
 from dishmap.quality import MEANING, names
 from dishmap.surface.fit import SurfaceFit
@@ -29,6 +29,10 @@ Array = NDArray[np.float64]
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "matplotlib", "plotly")
 # Rows and columns of the circles of the paper's Fig. 1.
 FIGURE_1_GRID = (9, 12)
+COMMON_ERRORS = (
+    "Errors of a grid's targets go together over the sheet, while sigmas of coefficients from noise are those of independent ones: they "
+    "are too small, for the broadest shapes several times."
+)
 
 
 def map_report(result: Map, image: NDArray[np.generic], title: str, inputs: dict[str, str]) -> str:
@@ -71,7 +75,8 @@ def _photograph(result: Map, numbers: Numbers, image: NDArray[np.generic]) -> st
     rest += " Thin dotted red: looks like a mark, but is not one of the pattern." if result.identity.rejected else ""
     frame = photograph_frame(image, outlines)
     part = f"Columns {frame.columns[0]} to {frame.columns[1] - 1}, rows {frame.rows[0]} to {frame.rows[1] - 1} of the photograph."
-    caption = f"{part} Each measured target is outlined as it was found, {how}, with its id.{rest} Hovering over a target tells more."
+    named = "with its id" if shows_ids(frame, outlines) else "too many for ids to be written"
+    caption = f"{part} Each measured target is outlined as it was found, {how}, {named}.{rest} Hovering over a target tells more."
     svg = photograph_svg(image, frame, outlines, "sigma of depth (mm)", alt)
     listed = [(str(i), reason) for i, reason in lost] + [(f"{count} without id", reason) for reason, count in unused_marks(result).items()]
     rejected = table(("target", "seen but not used, because"), listed, (0, 1)) if listed else ""
@@ -92,7 +97,7 @@ def _surface(result: Map, numbers: Numbers) -> str:
         "Surface",
         charts(_residual_figure(numbers, fit), _ratio_figure(numbers, fit)),
         f"<figure>{space}<figcaption>{caption}</figcaption></figure>",
-        _coefficients(fit),
+        _coefficients(fit, result.pattern.is_grid),
     )
 
 
@@ -152,7 +157,7 @@ def _sheet(result: Map) -> str:
     return section("What the grid showed of its print", about, table(("what", "value", "meaning"), rows, (0, 1, 2)))
 
 
-def _coefficients(fit: SurfaceFit) -> str:
+def _coefficients(fit: SurfaceFit, grid: bool) -> str:
     own = np.sqrt(np.diag(fit.covariance))
     shared = None if fit.calibration_covariance is None else np.sqrt(np.diag(fit.calibration_covariance))
     heads = ["coefficient", "value", "sigma, noise", *([] if shared is None else ["sigma, calibration"]), "unit"]
@@ -160,7 +165,8 @@ def _coefficients(fit: SurfaceFit) -> str:
     for i, name in enumerate(fit.names):
         sigmas = [number(float(own[i])), *([] if shared is None else [number(float(shared[i]))])]
         rows.append([name, f"{fit.coefficients[i]:.6g}", *sigmas, fit.units[i]])
-    return f"<h3>Coefficients of the {fit.basis.kind} (dish frame)</h3>" + table(heads, rows, (0, len(heads) - 1))
+    title = f"<h3>Coefficients of the {fit.basis.kind} (dish frame)</h3>"
+    return title + table(heads, rows, (0, len(heads) - 1)) + (paragraph(COMMON_ERRORS) if grid else "")
 
 
 def calibration_error_section(camera: Camera, image: NDArray[np.generic] | None) -> str:

@@ -26,6 +26,8 @@ FEWEST_FOR_FACTOR = 20
 SLOPE_STEP = 1e-4
 # So many ids are written out in a sentence.
 MOST_IDS = 12
+# So many reasons are told in a list of what to know.
+MOST_REASONS = 6
 # Edges of squares that lie outside their printed place by more than this part of the side are not where the pattern file has them.
 WRONG_SIDE_PART = 0.05
 LIMITS = {
@@ -149,6 +151,16 @@ def id_list(ids: ArrayLike) -> str:
     return ", ".join(values) if len(values) <= MOST_IDS else ", ".join(values[:MOST_IDS]) + f" and {len(values) - MOST_IDS} more"
 
 
+def common_reasons(lost: list[tuple[int, str]]) -> tuple[list[str], list[int]]:
+    """The reasons of (id, reason) that are told one by one: all of a few, else the commonest; and the ids of the others."""
+    reasons = Counter(reason for _, reason in lost)
+    if len(reasons) <= MOST_REASONS:
+        return list(reasons), []
+    usual = [reason for reason, _ in reasons.most_common(MOST_REASONS - 1)]
+    told = {ident for ident, reason in lost if reason in usual}
+    return usual, sorted({ident for ident, _ in lost} - told)
+
+
 def rejected_targets(result: Map) -> list[tuple[int, str]]:
     """Named targets that were not used, with the reason."""
     return [(ident, reason) for ident, reason in result.rejected if ident is not None]
@@ -219,7 +231,7 @@ def sheet_words(result: Map) -> list[tuple[str, str, str]]:
     edges = [
         (
             "Edges outside their printed place",
-            f"{sheet.spread_mm:.4f} ± {sheet.sigma_spread_mm:.4f} mm",
+            f"{number(sheet.spread_mm)} ± {number(sheet.sigma_spread_mm)} mm",
             f"squares have sides of {sheet.measured_side_mm:.3f} mm, {sheet.side_mm:g} mm by the pattern file; ink spreads, or dries up",
         )
     ]
@@ -270,8 +282,9 @@ def _warnings(result: Map, numbers: Numbers) -> list[str]:
             "alone, and what the calibration adds to positions and shape is not known. `dishmap calibrate` writes a camera with it."
         )
     if lost := rejected_targets(result):
-        reasons = Counter(reason for _, reason in lost)
-        said = "; ".join(f"{reason} ({id_list([i for i, r in lost if r == reason])})" for reason in reasons)
+        usual, others = common_reasons(lost)
+        said = "; ".join(f"{reason} ({id_list([i for i, r in lost if r == reason])})" for reason in usual)
+        said += f"; other reasons, listed below ({id_list(others)})" if others else ""
         out.append(f"{targets(len(lost))} seen but rejected: {said}.")
     if wrong := side_warning(result):
         out.append(wrong)
@@ -300,8 +313,12 @@ def _surface_warnings(result: Map) -> list[str]:
             f"{_surface_name(result)} does not follow (see the residual map)."
         )
     if fit.noise_factor is not None and fit.noise_factor * LARGE_FACTOR < 1 and len(fit.ids) >= FEWEST_FOR_FACTOR:
+        shared = (
+            "as those of one sheet do, of which the surface takes up the broadest"
+            if result.pattern.is_grid
+            else "such as the ink spread of lone discs, or they are too large"
+        )
         out.append(
-            f"Residuals are only {number(fit.noise_factor)} of the claimed sigmas: these hold a part that neighbours share, such as the "
-            "ink spread of lone discs, or they are too large."
+            f"Residuals are only {number(fit.noise_factor)} of the claimed sigmas: these hold a part that neighbours share, {shared}."
         )
     return out

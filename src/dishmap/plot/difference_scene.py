@@ -124,7 +124,7 @@ def _dots(table: DifferenceTable, points: Array, visible: bool) -> dict[str, Any
         "size": dot_size(len(points)),
         "symbol": ["x" if a else "circle" for a in aside.tolist()],
         "line": {"color": "#1a1a1a", "width": 1},
-        "colorbar": {"title": {"text": "change of<br>shape (mm)"}, "thickness": 16, "len": 0.7},
+        "colorbar": {"title": {"text": "change of<br>shape (mm)"}, "thickness": 16, "len": 0.7, "exponentformat": "none"},
     }
     where = {axis: _listed(points[:, i], 4) for i, axis in enumerate("xyz")}
     told = {"text": _hover_texts(table), "hovertemplate": "%{text}<extra></extra>"}

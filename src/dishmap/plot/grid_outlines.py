@@ -1,4 +1,4 @@
-"""How the targets of a grid are drawn over the photograph: outlines of squares, or crosses that join to the lattice's lines."""
+"""How the targets of a grid are drawn over the photograph: outlines of squares, or small crosses."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from dishmap.targets.pose import TargetPoses
 
 Array = NDArray[np.float64]
 
-# Corners of a square and arms of a crossing, in halves of its size along columns and rows.
+# Corners of a square and arms of a crossing, in halves of its size along columns and rows; the size of a cross, in steps.
 OUTLINE = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [1.0, 1.0]])
 ARMS = np.array([[[-1.0, 0.0], [1.0, 0.0]], [[0.0, -1.0], [0.0, 1.0]]])
+CROSS = 0.5
 # Targets that were not seen are drawn where their neighbours, up to so many columns and rows away, predict them.
 FARTHEST = 2
 
@@ -51,7 +52,7 @@ def node_strokes(result: Map, place_px: Array, step_px: Array) -> list[tuple[Arr
     """Strokes of nodes at places (K, 2) with steps of the lattice (K, 2, 2)."""
     pattern = result.pattern
     if pattern.lines:
-        shapes, part = ARMS, 1.0
+        shapes, part = ARMS, CROSS
     else:
         shapes, part = OUTLINE[None], _side_mm(result) / _pitch_mm(result)
     ends = place_px[:, None, None] + 0.5 * part * np.einsum("nij,spj->nspi", step_px, shapes)

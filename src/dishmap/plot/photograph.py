@@ -173,6 +173,11 @@ def picture(image: NDArray[np.generic], frame: Frame, quality: int, part: float 
     return f'<image width="{frame.width:.1f}" height="{frame.height:.1f}" preserveAspectRatio="none" href="{link}"/>'
 
 
+def shows_ids(frame: Frame, outlines: list[Outline]) -> bool:
+    """Whether there is room to write the ids of targets, and not on hovering alone."""
+    return _text_size(frame, outlines) > 0
+
+
 def _text_size(frame: Frame, outlines: list[Outline]) -> float:
     """Size of letters at which neighbouring ids do not touch; 0 where that is too small to read."""
     named = [o for o in outlines if o.label]
@@ -212,8 +217,9 @@ def _outline(frame: Frame, outline: Outline, color: str, text: float, thickness:
         paths = (frame.place(stroke).tolist() for stroke in outline.strokes_px)
         rings.append(f'<path d="{"".join("M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in path) for path in paths)}"/>')
     shapes = "".join(rings)
-    # a dark line under the coloured one keeps it visible on ink and on ground
-    lines = f'<g fill="none" stroke="#000000" stroke-width="{3.6 * thickness:.2g}">{shapes}</g>'
+    # a dark line under the coloured one keeps it visible on ink and on ground; strokes lie on ink, which is dark itself
+    under = "#ffffff" if outline.strokes_px and outline.state != "missing" else "#000000"
+    lines = f'<g fill="none" stroke="{under}" stroke-width="{3.6 * thickness:.2g}">{shapes}</g>'
     lines += f'<g fill="none" stroke="{color}" stroke-width="{2.2 * thickness:.2g}"{dash}>{shapes}</g>'
     (x, y), name = frame.place(outline.label_px).tolist(), ""
     if outline.state == "rejected":

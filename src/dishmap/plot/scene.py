@@ -116,7 +116,7 @@ def _stems(result: Map, numbers: Numbers, fit: SurfaceFit, foot: Array, top: Arr
         "cmax": limit,
         "size": dot_size(len(x)),
         "line": {"color": "#1a1a1a", "width": 1},
-        "colorbar": {"title": {"text": "residual (mm)"}, "thickness": 16, "len": 0.7},
+        "colorbar": {"title": {"text": "residual (mm)"}, "thickness": 16, "len": 0.7, "exponentformat": "none"},
     }
     shared = {"type": "scatter3d", "visible": visible}
     lines = {"mode": "lines", "hoverinfo": "skip", "x": line[0], "y": line[1], "z": line[2], "line": {"color": "#555555", "width": 3}}

@@ -49,9 +49,9 @@ LISTED_WAYS, ALTERNATIVES = 12, 3
 class GridIdentity:
     """A grid found in an image.
 
-    camera_from_dish: robust rigid fit to nominal places (rough on bent surfaces); index (K,) into the pattern; detection (K,) into the
-    detections; residual_px (K,): distance from where the rigid pose puts the target; alternatives: next best ways that were ruled out,
-    with the contradictions that each has more; rejected: detections that are not used, with reasons.
+    camera_from_dish: robust rigid fit to nominal places (rough on bent surfaces); index (K,) into the pattern, rising; detection (K,) into
+    the detections; residual_px (K,): distance from where the rigid pose puts the target; alternatives: next best ways that were ruled
+    out, with the contradictions that each has more; rejected: detections that are not used, with reasons.
     """
 
     camera_from_dish: Pose
@@ -99,6 +99,8 @@ def _identity(search: GridSearch, ways: Ways, chosen: int, fit: RigidFit) -> Gri
             parts.append((node[joined >= 0], joined[joined >= 0]))
             rejected += [Rejection(int(i), "it lies in line with the grid, but beyond its border") for i in node[joined < 0]]
     detection, target = (np.concatenate(p) for p in zip(*parts, strict=True))
+    order = np.argsort(target)
+    detection, target = detection[order], target[order]
     predicted = search.camera.project(fit.pose.apply(search.pattern.center_mm[target]))
     residual = np.linalg.norm(search.found.place_px[detection] - predicted, axis=1)
     return GridIdentity(fit.pose, target, detection, residual, _alternatives(search, ways, chosen), tuple(rejected))

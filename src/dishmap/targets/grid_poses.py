@@ -61,6 +61,8 @@ def poses_of(camera: Camera, pattern: Pattern, points: GridPoints, sheet: Sheet,
     information, pull = _own_likelihood(points, sheet)
     quality = points.quality | np.where(sheet.used, 0, int(Quality.OUTLIER))
     count = len(points)
+    rigid = rigid_pose(pattern, points.index[sheet.used], camera, center[sheet.used], start)
+    off_rigid = center + sheet.residual[:, :2] - camera.project(rigid.apply(pattern.center_mm[points.index]))
     return TargetPoses(
         index=points.index,
         ids=pattern.ids[points.index],
@@ -81,24 +83,29 @@ def poses_of(camera: Camera, pattern: Pattern, points: GridPoints, sheet: Sheet,
         noise=points.noise,
         kept=points.kept,
         quality=quality,
-        camera_from_dish=rigid_pose(pattern, points.index[sheet.used], camera, center[sheet.used], start),
+        camera_from_dish=rigid,
         normal_sigma_rad=0.0,
         noise_model=points.noise_model,
         log_gamma=0.0,
         rejected=points.rejected,
-        sheet=_summary(pattern, points, sheet, rotation),
+        sheet=_summary(pattern, points, sheet, rotation, off_rigid),
     )
 
 
-def _summary(pattern: Pattern, points: GridPoints, sheet: Sheet, rotation: Array) -> SheetSummary:
-    """What was learnt, and how far places lie from the smooth surface."""
+def _summary(pattern: Pattern, points: GridPoints, sheet: Sheet, rotation: Array, off_rigid: Array) -> SheetSummary:
+    """What was learnt, and how far places lie from the smooth surface and (N, 2) from the rigid pattern."""
     sizes = sheet.sizes
     noise = np.linalg.inv(points.information)[:, range(2), range(2)]
     by_print = sizes.print_mm * (sheet.by_place[:, :2] @ rotation[..., :2])
     clean = sheet.used & (points.quality == 0)
-    off, expected, printed = (
+    off, expected, printed, rigid = (
         float(np.sqrt(per_target[clean if clean.any() else sheet.used].mean()))
-        for per_target in ((sheet.off_px**2).sum(axis=1), noise.sum(axis=1), (by_print**2).sum(axis=(1, 2)))
+        for per_target in (
+            (sheet.off_px**2).sum(axis=1),
+            noise.sum(axis=1),
+            (by_print**2).sum(axis=(1, 2)),
+            (off_rigid**2).sum(axis=1),
+        )
     )
     side = 0.0 if pattern.lines else 2 * float(np.median([np.abs(pattern.kind_of(i).polygons[0].corners_mm).max() for i in points.index]))
     return SheetSummary(
@@ -112,6 +119,7 @@ def _summary(pattern: Pattern, points: GridPoints, sheet: Sheet, rotation: Array
         fit_rms_px=off,
         noise_rms_px=expected,
         print_rms_px=printed,
+        rigid_rms_px=rigid,
     )
 
 

@@ -74,7 +74,7 @@ class SheetSummary:
     sheet; rough_mm: third derivatives along the normal, mm per lattice step cubed; side_mm: printed side of squares by the pattern file,
     spread_mm: how far their edges lie outside it, sigma_spread_mm, all three 0 for crossings. Root mean squares over clean targets, of
     distances in the photograph: fit_rms_px between measured places and the smooth surface, of which noise_rms_px is expected from the
-    photograph's noise and print_rms_px from printing errors.
+    photograph's noise and print_rms_px from printing errors; rigid_rms_px between them and the undeformed pattern in its rigid pose.
     """
 
     print_mm: float
@@ -87,6 +87,7 @@ class SheetSummary:
     fit_rms_px: float
     noise_rms_px: float
     print_rms_px: float
+    rigid_rms_px: float
 
     @property
     def measured_side_mm(self) -> float:
