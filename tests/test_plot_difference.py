@@ -14,6 +14,7 @@ from dishmap.compare import joint_table
 from dishmap.plot.difference import change_map, misfit_histogram, misfit_map, ratio_map_chart, zernike_bars
 from dishmap.plot.difference_photograph import arrows_of, arrows_svg
 from dishmap.plot.difference_scene import difference_scene, exaggeration
+from dishmap.plot.maps import marks
 
 SVG = "{http://www.w3.org/2000/svg}"
 XY = np.array([[0.0, 0.0], [100.0, 0.0], [0.0, 80.0], [100.0, 80.0], [40.0, 30.0]])
@@ -139,3 +140,27 @@ def test_noise_is_not_exaggerated_to_hills() -> None:
     traces, layout = difference_scene(rows, PLATE.normal)
     assert layout["scene"]["zaxis"]["range"][0] < 0 < layout["scene"]["zaxis"]["range"][1]
     assert {trace["type"] for trace in traces} == {"mesh3d", "scatter3d"}
+
+
+def test_of_many_targets_some_arrows_are_drawn_the_longest_among_them() -> None:
+    columns, rows = np.meshgrid(np.arange(50.0), np.arange(40.0))
+    at = 100 + 20 * np.column_stack([columns.ravel(), rows.ravel()])
+    move = np.full((2000, 2), 0.1)
+    move[777] = [0.9, 0.0]
+    arrows = arrows_of((1200, 1000), at, move, tuple(str(i) for i in range(2000)))
+    assert arrows.of == 2000
+    assert 200 < len(arrows.titles) < 1000
+    assert "777" in arrows.titles
+    # each stays with its own title
+    assert all((arrows.from_px[k] == at[int(title)]).all() for k, title in enumerate(arrows.titles))
+    assert is_svg(arrows_svg(None, arrows, "many"))
+    few = arrows_of((1200, 1000), at[::97], move[::97], tuple(str(i) for i in range(21)))
+    assert len(few.titles) == few.of == 21
+
+
+def test_marks_shrink_where_points_are_many() -> None:
+    columns, rows = np.meshgrid(np.arange(45.0), np.arange(45.0))
+    many = np.column_stack([columns.ravel(), rows.ravel()])
+    # marks of the usual size would hide each other: as wide as the way to the next, in a map of some 330 points
+    assert marks(many, 26)["s"] < (330 / 45) ** 2 / 2
+    assert marks(XY, 26)["s"] == pytest.approx(26)

@@ -26,7 +26,7 @@ from dishmap.surface.cloud import select_points
 from dishmap.targets.builders import dish, plate
 from dishmap.targets.identify import Upright
 from dishmap.transforms import Pose
-from dishmap.verdict import number, numbers_of, verdict_of
+from dishmap.verdict import common_reasons, number, numbers_of, verdict_of
 
 # plotly.js itself is 4.8 MB.
 LARGEST_BYTES = 6_000_000
@@ -367,3 +367,14 @@ def test_the_report_of_a_calibration() -> None:
     assert ["fx", "800", "0.300", "px"] in parsed(html).rows
     assert "this radius is an expected error of" in said
     assert calibration_report(calibration, HOSTILE, Checks()) == html
+
+
+def test_many_reasons_are_told_briefly() -> None:
+    few = [(1, "glare"), (2, "glare"), (3, "clipped")]
+    assert common_reasons(few) == (["glare", "clipped"], [])
+    many = [*few, *((10 + k, f"it lies {k} px off") for k in range(8))]
+    usual, others = common_reasons(many)
+    assert usual[:2] == ["glare", "clipped"]
+    assert len(usual) == 5
+    # whoever is told already is not among the others
+    assert others == [13, 14, 15, 16, 17]
