@@ -34,7 +34,7 @@ MEANING: dict[Quality, str] = {
     Quality.OCCLUDED: "part of the target is hidden, overprinted or too near its neighbour; the rest was measured",
     Quality.GLARE: "saturated pixels, which were left out, or light that bends across the target, which was fitted; sigmas are wider",
     Quality.POOR_FIT: "the pixels differ from the model by more than the image's noise explains; sigmas are scaled up",
-    Quality.TOO_SMALL: "the smallest printed circle is under 2 px in radius",
+    Quality.TOO_SMALL: "the smallest printed circle is under 2 px in radius, a line under 1 px wide or a square under 4 px",
     Quality.AMBIGUOUS_NORMAL: "a mirrored normal fits nearly as well; the one that pixels and the pattern's surface make likelier is given",
     Quality.OFF_SURFACE: "the target lies, or moved, far from the surface through its neighbours",
     Quality.NOT_CONVERGED: "the fit to the pixels did not converge",
