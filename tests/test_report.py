@@ -26,7 +26,7 @@ from dishmap.surface.cloud import select_points
 from dishmap.targets.builders import dish, plate
 from dishmap.targets.identify import Upright
 from dishmap.transforms import Pose
-from dishmap.verdict import common_reasons, number, numbers_of, verdict_of
+from dishmap.verdict import common_reasons, number, numbers_of, rows_of_reasons, verdict_of
 
 # plotly.js itself is 4.8 MB.
 LARGEST_BYTES = 6_000_000
@@ -378,3 +378,5 @@ def test_many_reasons_are_told_briefly() -> None:
     assert len(usual) == 5
     # whoever is told already is not among the others
     assert others == [13, 14, 15, 16, 17]
+    assert rows_of_reasons(few) == [("1", "glare"), ("2", "glare"), ("3", "clipped")]
+    assert rows_of_reasons([*many, (20, "glare"), (21, "glare")])[0] == ("1, 2, 20, 21", "glare")

@@ -23,7 +23,7 @@ from dishmap.plot.outlines import check_picture
 from dishmap.quality import MEANING, Quality, names
 from dishmap.report import inputs_section
 from dishmap.surface.zernike import term_name
-from dishmap.verdict import Fact, id_list, number, targets
+from dishmap.verdict import Fact, id_list, number, rows_of_reasons, targets
 
 Array = NDArray[Any]
 
@@ -279,7 +279,7 @@ def _quality(result: Difference) -> str:
     flags = [(names(int(flag)), id_list(rows.ids[(bits & int(flag)) != 0]), meaning) for flag, meaning in MEANING.items()]
     flags = [row for row in flags if row[1]]
     clean = paragraph(f"{int((bits == 0).sum())} of {targets(len(bits))} compared are clean in both states, that is without a flag.")
-    lost = [(str(ident), reason) for ident, reason in unused_targets(result)]
+    lost = rows_of_reasons(unused_targets(result))
     return section(
         "Outliers and flags",
         clean,

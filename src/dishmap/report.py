@@ -22,7 +22,18 @@ from dishmap.plot.photograph import error_svg, photograph_frame, photograph_svg,
 from dishmap.plot.scene import exaggeration, scene_of
 from dishmap.quality import MEANING, names
 from dishmap.surface.fit import SurfaceFit
-from dishmap.verdict import Numbers, Verdict, number, numbers_of, rejected_targets, sheet_words, targets, unused_marks, verdict_of
+from dishmap.verdict import (
+    Numbers,
+    Verdict,
+    number,
+    numbers_of,
+    rejected_targets,
+    rows_of_reasons,
+    sheet_words,
+    targets,
+    unused_marks,
+    verdict_of,
+)
 
 Array = NDArray[np.float64]
 
@@ -78,7 +89,7 @@ def _photograph(result: Map, numbers: Numbers, image: NDArray[np.generic]) -> st
     named = "with its id" if shows_ids(frame, outlines) else "too many for ids to be written"
     caption = f"{part} Each measured target is outlined as it was found, {how}, {named}.{rest} Hovering over a target tells more."
     svg = photograph_svg(image, frame, outlines, "sigma of depth (mm)", alt)
-    listed = [(str(i), reason) for i, reason in lost] + [(f"{count} without id", reason) for reason, count in unused_marks(result).items()]
+    listed = rows_of_reasons(lost) + [(f"{count} without id", reason) for reason, count in unused_marks(result).items()]
     rejected = table(("target", "seen but not used, because"), listed, (0, 1)) if listed else ""
     return section("Photograph", figure(svg, caption), rejected)
 

@@ -161,6 +161,14 @@ def common_reasons(lost: list[tuple[int, str]]) -> tuple[list[str], list[int]]:
     return usual, sorted({ident for ident, _ in lost} - told)
 
 
+def rows_of_reasons(lost: list[tuple[int, str]]) -> list[tuple[str, str]]:
+    """Rows (id, reason) of a table: one a target, or of many targets one a reason, with all of its ids."""
+    if len(lost) <= MOST_IDS:
+        return [(str(ident), reason) for ident, reason in lost]
+    reasons = dict.fromkeys(reason for _, reason in lost)
+    return [(", ".join(str(ident) for ident, other in lost if other == reason), reason) for reason in reasons]
+
+
 def rejected_targets(result: Map) -> list[tuple[int, str]]:
     """Named targets that were not used, with the reason."""
     return [(ident, reason) for ident, reason in result.rejected if ident is not None]
