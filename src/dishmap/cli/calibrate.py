@@ -77,6 +77,8 @@ def calibrate_command(
     **described: Any,
 ) -> None:
     """Calibrate a camera from 10 to 20 photographs of a flat board, tilted to all sides, with fixed focus and zoom."""
+    from threadpoolctl import threadpool_limits
+
     from dishmap.io.atomic import check_target, output_folder, write_files
     from dishmap.io.camera_file import camera_text
     from dishmap.io.camera_formats import SUFFIXES, camera_in_format
@@ -89,7 +91,8 @@ def calibrate_command(
     for file in (out, page, *files.values()):
         refuse_overwriting(file, [*photos, *board_file(board)])
         check_target(file)
-    with output_folder(out.parent):
+    # lens models and refits run two at a time; BLAS threads besides would stand in their way
+    with output_folder(out.parent), threadpool_limits(limits=1, user_api="blas"):
         names = _names(photos)
         result, choice, not_found = _calibrated(what, photos, names, Solver(lens, flat_board, readout))
         texts = {form: camera_in_format(result.camera, form, out.stem) for form in files}
