@@ -270,6 +270,11 @@ def shows_place_only(information: Array) -> NDArray[np.bool_]:
     return np.asarray(~information[:, 3:, 3:].any(axis=(1, 2)))
 
 
+def move_of_pixels(by_point: Array) -> Array:
+    """The least move (N, 3, 2), in mm, that shifts the images of points by one pixel; by_point (N, 2, 3): d pixels / d point."""
+    return np.asarray(np.swapaxes(by_point, 1, 2) @ np.linalg.inv(by_point @ np.swapaxes(by_point, 1, 2)))
+
+
 def _seen_from(aligned: TargetPoses, after: TargetPoses, camera: Camera) -> TargetPoses:
     """The current state with the likelihood of crossings taken at the reference's places, moved, instead of at its own.
 
@@ -279,7 +284,7 @@ def _seen_from(aligned: TargetPoses, after: TargetPoses, camera: Camera) -> Targ
     if not len(rows):
         return after
     seen, by_point = camera.project_with_point_jacobian(after.position_mm[rows])
-    back = np.swapaxes(by_point, 1, 2) @ np.linalg.inv(by_point @ np.swapaxes(by_point, 1, 2))
+    back = move_of_pixels(by_point)
     weight = np.swapaxes(back, 1, 2) @ after.information[rows, :3, :3] @ back
     pulled = np.einsum("nji,nj->ni", back, after.pull[rows, :3])
     measured = seen + np.linalg.solve(weight, pulled[..., None])[..., 0]

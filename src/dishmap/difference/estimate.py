@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from dishmap.camera.model import Camera
-from dishmap.difference.changes import LEAST_TARGETS, TargetChanges
+from dishmap.difference.changes import LEAST_TARGETS, TargetChanges, move_of_pixels
 from dishmap.difference.joint import RANGES, Evidence, Posterior, Sizes, determined, learn_sizes, misfit, penalty, posterior
 from dishmap.difference.model import BLOCKS, WAYS, Columns, Kernel, Surfaces, columns_of, curved_change, smooth_kernel, surfaces_of
 from dishmap.difference.priors import Priors
@@ -155,8 +155,7 @@ class _Problem:
             at = self.changes.position_mm[rows]
             before, by_point = self.camera.project_with_point_jacobian(at)
             more = self.camera.project(at + move[rows]) - before - np.einsum("nij,nj->ni", by_point, move[rows])
-            back = np.swapaxes(by_point, 1, 2) @ np.linalg.inv(by_point @ np.swapaxes(by_point, 1, 2))
-            out[rows] = (back @ more[..., None])[..., 0]
+            out[rows] = (move_of_pixels(by_point) @ more[..., None])[..., 0]
         return out
 
     def _hub(self) -> Array:
