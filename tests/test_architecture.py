@@ -74,6 +74,8 @@ ORDER = [
     *("pipeline", "compare", "figures"),
     # and what it would give, before there is a photograph
     "planning",
+    # from surface to signal
+    *("rf.antenna", "rf.pattern"),
     # paper to print
     *("sheet.shapes", "sheet.pdf", "sheet.svg", "sheet.flatten", "sheet.pieces", "sheet.outline", "sheet.ruled"),
     *("sheet.seams", "sheet.gores", "sheet.markers"),
@@ -136,6 +138,9 @@ WALLS = {
     # files that people write are checked where they are read
     "pydantic": ["io", "cli"],
     "pydantic_core": ["io"],
+    "xarray": ["io"],
+    # Fourier sums over scattered points
+    "finufft": ["rf.farfield"],
 }
 # numpy and scipy may stand anywhere; a library in neither list is not a dependency of this project
 FREE = ["numpy", "scipy", "threadpoolctl"]
@@ -153,7 +158,7 @@ PROGRAM = ["cli", "__main__"]
 PROGRAM_CALLS = {"print", "input", "exit", "quit", "_exit"}
 
 # Loaded by a plain `import dishmap`, each of these costs a user more than all of dishmap.
-HEAVY = ["cv2", "scipy", "pydantic", "matplotlib", "plotly", "click", "rich", "numpy"]
+HEAVY = ["cv2", "finufft", "scipy", "pydantic", "matplotlib", "plotly", "click", "rich", "xarray", "numpy"]
 # The ground floor: people who only read a pattern or project points wait for numpy alone.
 LIGHT = ["errors", "quality", "transforms", "camera.model", "targets.pattern"]
 
