@@ -75,7 +75,7 @@ ORDER = [
     # and what it would give, before there is a photograph
     "planning",
     # from surface to signal
-    *("rf.antenna", "rf.pattern"),
+    *("rf.antenna", "rf.pattern", "rf.deformation"),
     # paper to print
     *("sheet.shapes", "sheet.pdf", "sheet.svg", "sheet.flatten", "sheet.pieces", "sheet.outline", "sheet.ruled"),
     *("sheet.seams", "sheet.gores", "sheet.markers"),
