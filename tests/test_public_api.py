@@ -35,7 +35,7 @@ def test_the_tables_agree() -> None:
 
 
 def test_a_wrong_name_is_answered_with_the_right_ones() -> None:
-    with pytest.raises(AttributeError, match=r"no attribute 'Kamera'; the public names are Anchors, Assumptions, "):
+    with pytest.raises(AttributeError, match=r"no attribute 'Kamera'; the public names are Anchors, Antenna, Assumptions, "):
         _ = dishmap.Kamera
 
 

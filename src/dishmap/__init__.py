@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from dishmap.camera.undistort import undistort_image, undistort_points
     from dishmap.compare import compare_photographs
     from dishmap.difference.priors import Priors
+    from dishmap.io.antenna_file import read_antenna
     from dishmap.io.camera_file import read_camera, write_camera
     from dishmap.io.difference_file import read_difference
     from dishmap.io.images import read_gray, read_turn_deg
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from dishmap.io.sheet_file import write_sheets
     from dishmap.pipeline import map_photograph
     from dishmap.planning import Conditions, camera_of_lens, plan
+    from dishmap.rf.antenna import Antenna
     from dishmap.sheet.boards import charuco, chessboard
     from dishmap.sheet.paper import paper_of
     from dishmap.sheet.sheets import as_printed, board_sheets, pattern_sheets
@@ -55,6 +57,7 @@ if TYPE_CHECKING:
 # Where each public name lives; the imports above say the same to type checkers, and a test holds the two together.
 _HOME = {
     "Anchors": "dishmap.targets.identify",
+    "Antenna": "dishmap.rf.antenna",
     "Assumptions": "dishmap.targets.stages",
     "Basis": "dishmap.surface.fit",
     "Camera": "dishmap.camera.model",
@@ -94,6 +97,7 @@ _HOME = {
     "pattern_sheets": "dishmap.sheet.sheets",
     "plan": "dishmap.planning",
     "plate": "dishmap.targets.builders",
+    "read_antenna": "dishmap.io.antenna_file",
     "read_camera": "dishmap.io.camera_file",
     "read_difference": "dishmap.io.difference_file",
     "read_gray": "dishmap.io.images",
@@ -113,6 +117,7 @@ _OTHER_NAME = {"simulate_photograph": "simulate"}
 
 __all__ = [
     "Anchors",
+    "Antenna",
     "Assumptions",
     "Basis",
     "Camera",
@@ -152,6 +157,7 @@ __all__ = [
     "pattern_sheets",
     "plan",
     "plate",
+    "read_antenna",
     "read_camera",
     "read_difference",
     "read_gray",

@@ -7,20 +7,18 @@ relative to the scenario's own folder.
 
 from __future__ import annotations
 
-import difflib
 import os
-import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic import BaseModel, Field
 
 from dishmap.camera.model import Camera
 from dishmap.errors import InputError
 from dishmap.io.camera_file import read_camera
-from dishmap.io.scenario_pattern import STRICT, PatternSource, pattern_of
+from dishmap.io.scenario_pattern import PatternSource, pattern_of
+from dishmap.io.toml_file import STRICT, checked, toml_content, toml_text
 from dishmap.simulate.deform import Bump, Crease, Deformation, Gores, ZernikeTerm
 from dishmap.simulate.scenario import Scenario, State
 from dishmap.simulate.scene import (
@@ -42,8 +40,6 @@ from dishmap.targets.pattern import Pattern
 from dishmap.transforms import Pose
 
 FORMAT = "dishmap-scenario/1"
-# A scenario is written by hand.
-LARGEST_FILE_BYTES = 1_000_000
 # Names of states become names of files.
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._+-]{0,99}$"
 
@@ -230,29 +226,16 @@ class ScenarioModel(_Model):
 
 def read_scenario(path: str | os.PathLike[str]) -> Scenario:
     """Read a scenario file and the files it names. Raises InputError, naming the file and what is wrong in it."""
-    try:
-        if os.path.getsize(path) > LARGEST_FILE_BYTES:
-            raise InputError(f"{path} is larger than {LARGEST_FILE_BYTES // 10**6} MB, so it is no scenario file")
-        text = Path(path).read_bytes().decode("utf-8-sig")
-    except OSError as error:
-        raise InputError(f"cannot read the scenario file {path}: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is no scenario file: it is not text in UTF-8") from error
+    text = toml_text(path, "scenario file")
     return parse_scenario(text, Path(path).parent, str(path))
 
 
 def parse_scenario(text: str, folder: str | os.PathLike[str] = ".", source: str = "the scenario") -> Scenario:
     """Make a Scenario of the text of a scenario file, whose files are found in `folder`. Raises InputError."""
-    try:
-        content = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise InputError(f"{source} is not valid TOML: {error}") from error
+    content = toml_content(text, source)
     if content.get("format") != FORMAT:
         raise InputError(f"{source} is no scenario file: its first line must be format = {FORMAT!r}")
-    try:
-        model = ScenarioModel.model_validate(content)
-    except ValidationError as error:
-        raise InputError(f"{source}: {_sentence(error)}") from error
+    model = checked(content, ScenarioModel, source)
     try:
         return _scenario(model, Path(folder))
     except InputError as error:
@@ -359,44 +342,3 @@ def _zernike(model: ZernikeModel) -> ZernikeTerm:
 
 def _pair(values: list[float]) -> tuple[float, float]:
     return float(values[0]), float(values[1])
-
-
-def _sentence(error: ValidationError) -> str:
-    """One sentence for the error a user should mend first: a misspelt key before the key it leaves missing."""
-    errors = error.errors(include_url=False, include_context=True, include_input=True)
-    first = min(errors, key=lambda e: (e["type"] != "extra_forbidden", e["type"] != "missing"))
-    more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-    return f"{_explain(first)}{more}"
-
-
-def _explain(error: ErrorDetails) -> str:
-    place, key = _place(error["loc"][:-1]), str(error["loc"][-1])
-    if error["type"] == "extra_forbidden":
-        fields = list(_model_at(error["loc"]).model_fields)
-        near = difflib.get_close_matches(key, fields, n=1, cutoff=0.0)[0]
-        return f"unknown key {key!r} in {place}; the nearest valid one is {near!r} (all: {', '.join(fields)})"
-    if error["type"] == "missing":
-        return f"{place} lacks the key {key!r}"
-    value = repr(error["input"])
-    message = error["msg"].replace("Input should be", "must be").replace("List should have", "must have")
-    return f"{_place(error['loc'])} {message[0].lower()}{message[1:]}, not {value if len(value) <= 60 else f'{value[:57]}...'}"
-
-
-def _model_at(loc: tuple[int | str, ...]) -> type[BaseModel]:
-    """The model in which the last part of a location stands."""
-    model: type[BaseModel] = ScenarioModel
-    for part in loc[:-1]:
-        if isinstance(part, str):
-            model = _model_in(model.model_fields[part].annotation) or model
-    return model
-
-
-def _model_in(annotation: Any) -> type[BaseModel] | None:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    return next((found for part in get_args(annotation) if (found := _model_in(part)) is not None), None)
-
-
-def _place(loc: tuple[int | str, ...]) -> str:
-    text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc).lstrip(".")
-    return text or "the file"

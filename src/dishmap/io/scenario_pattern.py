@@ -7,19 +7,16 @@ import inspect
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel
 
 from dishmap.errors import InputError
 from dishmap.io.pattern_file import read_pattern
+from dishmap.io.toml_file import STRICT
 from dishmap.targets.builders import KIND_BUILDERS, dish, plate
 from dishmap.targets.grid_builders import grid, grid_surface
 from dishmap.targets.pattern import Pattern, TargetKind
 
 KindName = Literal["disc", "ring", "concentric", "multi", "whycon"]
-
-
-# Tables of scenario files: unknown keys and loose types are refused.
-STRICT = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class _Model(BaseModel):
