@@ -76,6 +76,7 @@ ORDER = [
     "planning",
     # from surface to signal
     *("rf.antenna", "rf.pattern", "rf.deformation"),
+    *("rf.aperture", "rf.feed", "rf.correction", "rf.subreflector", "rf.rays", "rf.sources", "rf.farfield"),
     # paper to print
     *("sheet.shapes", "sheet.pdf", "sheet.svg", "sheet.flatten", "sheet.pieces", "sheet.outline", "sheet.ruled"),
     *("sheet.seams", "sheet.gores", "sheet.markers"),

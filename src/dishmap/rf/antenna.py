@@ -77,8 +77,9 @@ class Feed:
     kind: `gaussian`: edge_taper_db below the axis at the rim's angle, falling with the square of the angle; `cosine`: field
     cos(theta) to the power `exponent`, or to that which gives edge_taper_db at the rim's angle, nothing behind; `aperture`: the field over
     the aperture, space attenuation included, is Gaussian and edge_taper_db below its middle at the rim; `cut`: a table. Tapers are
-    positive numbers of dB. All but the table are Huygens sources (no cross-polarisation on their own). polarization: `x`, `y`, `right`
-    or `left` (as the feed has it). Raises InputError for what does not go together.
+    positive numbers of dB. All but the table are Huygens sources (no cross-polarisation on their own). polarization: of the antenna's beam,
+    `x`, `y`, `right` or `left` (each reflection turns the hand, so at the prime focus the feed itself has the other one). The aperture
+    kind is exact for a centred aperture. Raises InputError for what does not go together.
     """
 
     kind: str = "gaussian"

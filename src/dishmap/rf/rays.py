@@ -1,0 +1,191 @@
+"""Exact rays from the feed to the dish: path, direction, field, and how the path changes with every actuator.
+
+At the prime focus a ray is a straight line. Off a subreflector it is the one whose path is stationary (Fermat), found by Newton's method
+for each point of the dish; its field follows from the power in the cone between neighbouring rays, and the derivative of its path to
+anything that moves the subreflector is that of the path at a fixed point of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dishmap.errors import InputError
+from dishmap.rf.antenna import Antenna
+from dishmap.rf.correction import Correction
+from dishmap.rf.feed import FeedField, feed_field, radiated
+from dishmap.rf.subreflector import Patch, SubSurface, beyond_rim, local_xy, nominal_reflection, patch, shape_columns, sub_surface
+from dishmap.transforms import right_jacobian, rotation_from_vector
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+# Newton's method for the point of reflection: steps, and when it stands still, in mm.
+STEPS, STILL_MM = 30, 1e-9
+LONGEST_STEP = 0.3
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Rays from the feed to N points of the dish.
+
+    path_mm (N,): from the feed's phase centre; direction (N, 3): of arrival; field (N, 3): electric field there without the phase of the
+    path, for a feed that radiates unit power; by_values (N, 5 + T): derivative of the path to the values of the correction (mm per mm
+    or degree); lost (N,): no ray arrives. reflection_mm (N, 3): where the subreflector was met, NaN at the prime focus.
+    """
+
+    path_mm: Array
+    direction: Array
+    field: Complex
+    by_values: Array
+    lost: NDArray[np.bool_]
+    reflection_mm: Array
+
+
+@dataclass(frozen=True)
+class FeedPlace:
+    """Where a feed stands and how: phase centre (3,), rotation dish_from_feed (3, 3), and its field."""
+
+    center_mm: Array
+    rotation: Array
+    field: FeedField
+
+
+def feed_place(antenna: Antenna) -> FeedPlace:
+    """The feed in its nominal place, with its axis in the middle of the cone of rays to the rim."""
+    main, sub = antenna.reflector, antenna.subreflector
+    edges = main.offset_mm + np.array([-0.5, 0.5]) * main.diameter_mm
+    rim = np.stack([edges, np.zeros(2), edges**2 / (4 * main.focal_length_mm)], axis=1)
+    if sub is None:
+        center, seen = main.focus_mm, rim
+        down = -1.0
+    else:
+        center, seen = main.focus_mm - [0.0, 0.0, sub.foci_distance_mm], nominal_reflection(main, sub, rim)
+        down = 1.0
+    way = seen - center
+    angle = np.arctan2(way[:, 0], down * way[:, 2])
+    middle, edge = float(angle.mean()), float(abs(np.ptp(angle)) / 2)
+    z = np.array([np.sin(middle), 0.0, down * np.cos(middle)])
+    y = np.array([0.0, down, 0.0])
+    rotation = np.stack([np.cross(y, z), y, z], axis=1)
+    return FeedPlace(center, rotation, feed_field(antenna.feed, edge, 1 if sub is None else 2))
+
+
+def trace(antenna: Antenna, feed: FeedPlace, points_mm: Array, correction: Correction) -> Rays:
+    """Rays from the feed to points (N, 3) of the dish, after a correction.
+
+    Raises InputError when the subreflector would reach the dish or the feed.
+    """
+    if antenna.subreflector is None:
+        return _straight(feed, points_mm, correction)
+    surface = sub_surface(antenna, correction)
+    return _reflected(antenna, surface, feed, points_mm, correction)
+
+
+def _straight(feed: FeedPlace, points: Array, correction: Correction) -> Rays:
+    """From a feed that was tilted about its phase centre and shifted."""
+    turn = rotation_from_vector([*np.radians(correction.tilt_deg), 0.0]) @ feed.rotation
+    way = points - (feed.center_mm + correction.shift_mm)
+    path = np.linalg.norm(way, axis=1)
+    direction = way / path[:, None]
+    field = radiated(feed.field, direction @ turn) @ turn.T / path[:, None]
+    by = np.zeros((len(points), 5))
+    by[:, :3] = -direction
+    return Rays(path, direction, field, by, np.zeros(len(points), bool), np.full_like(points, np.nan))
+
+
+def _reflected(antenna: Antenna, surface: SubSurface, feed: FeedPlace, points: Array, correction: Correction) -> Rays:
+    assert antenna.subreflector is not None
+    xy = local_xy(surface, nominal_reflection(antenna.reflector, antenna.subreflector, points))
+    xy, found, here = _stationary(surface, feed.center_mm, points, xy)
+    lost = ~found | beyond_rim(surface, xy)
+    _check_clear(antenna, feed, here)
+    up, down = here.point_mm - feed.center_mm, points - here.point_mm
+    d1, d2 = np.linalg.norm(up, axis=1), np.linalg.norm(down, axis=1)
+    a, b = up / d1[:, None], down / d2[:, None]
+    normal = np.cross(here.first[:, :, 0], here.first[:, :, 1])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    sent = radiated(feed.field, a @ feed.rotation) @ feed.rotation.T
+    field = 2 * (normal * sent).sum(axis=1, keepdims=True) * normal - sent
+    field = field * np.sqrt(_concentration(here, a, b, d1, d2))[:, None]
+    field[lost] = 0.0
+    return Rays(d1 + d2, b, field, _by_values(surface, here, xy, a - b, correction), lost, here.point_mm)
+
+
+def _stationary(surface: SubSurface, start: Array, points: Array, xy: Array) -> tuple[Array, NDArray[np.bool_], Patch]:
+    """Own x, y (N, 2) of the points of reflection, whether they were found, and the subreflector there."""
+    reach = LONGEST_STEP * surface.radius_mm
+    for _ in range(STEPS):
+        here = patch(surface, xy)
+        a, b, d1, d2 = _ways(here.point_mm, start, points)
+        gradient = np.einsum("nij,ni->nj", here.first, a - b)
+        step = -_solve(_hessian(here, a, b, d1, d2), gradient[..., None])[..., 0]
+        long = np.linalg.norm(step, axis=1, keepdims=True)
+        xy = xy + step * np.minimum(1.0, reach / np.maximum(long, 1e-300))
+        if (long < STILL_MM).all():
+            break
+    return xy, np.asarray(long[:, 0] < 1e3 * STILL_MM), patch(surface, xy)
+
+
+def _ways(q: Array, start: Array, points: Array) -> tuple[Array, Array, Array, Array]:
+    up, down = q - start, points - q
+    d1, d2 = np.linalg.norm(up, axis=1), np.linalg.norm(down, axis=1)
+    return up / d1[:, None], down / d2[:, None], d1, d2
+
+
+def _hessian(here: Patch, a: Array, b: Array, d1: Array, d2: Array) -> Array:
+    """Second derivative (N, 2, 2) of the path to the point of reflection."""
+    bent = np.einsum("nijk,ni->njk", here.second, a - b)
+    flat = np.zeros_like(bent)
+    for way, distance in ((a, d1), (b, d2)):
+        along = np.einsum("nij,ni->nj", here.first, way)
+        flat += (np.einsum("nij,nik->njk", here.first, here.first) - along[:, :, None] * along[:, None, :]) / distance[:, None, None]
+    return np.asarray(bent + flat)
+
+
+def _concentration(here: Patch, a: Array, b: Array, d1: Array, d2: Array) -> Array:
+    """Solid angle (N,) at the feed for each area across the arriving ray: how much power arrives there, in 1/mm^2.
+
+    A step e across the ray at the dish moves the point of reflection by H^-1 Q' e / d2, by the implicit function theorem.
+    """
+    e1 = np.cross(b, np.where(np.abs(b[:, :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
+    e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
+    across = np.stack([e1, np.cross(b, e1)], axis=2)
+    right = np.swapaxes(here.first, 1, 2) @ across / d2[:, None, None]
+    moved = here.first @ _solve(_hessian(here, a, b, d1, d2), right)
+    turned = (moved - a[:, :, None] * np.einsum("ni,nij->nj", a, moved)[:, None]) / d1[:, None, None]
+    return np.abs((a * np.cross(turned[:, :, 0], turned[:, :, 1])).sum(axis=1))
+
+
+def _by_values(surface: SubSurface, here: Patch, xy: Array, gap: Array, correction: Correction) -> Array:
+    """Derivative of the path to shift, tilt and shape: gap = a - b, times how the point of reflection is carried."""
+    out = np.empty((len(xy), 5 + len(surface.terms)))
+    out[:, :3] = gap
+    arm = here.point_mm - surface.vertex_mm
+    # d(R p) = (J w) x (R p), J the left Jacobian: the right one of the opposite turn
+    spin = right_jacobian([*-np.radians(correction.tilt_deg), 0.0])[:, :2] * np.radians(1.0)
+    out[:, 3:5] = np.cross(arm, gap) @ spin
+    if surface.terms:
+        out[:, 5:] = np.einsum("ni,nit->nt", gap, shape_columns(surface, xy))
+    return out
+
+
+def _check_clear(antenna: Antenna, feed: FeedPlace, here: Patch) -> None:
+    """Raise InputError when the subreflector touches the dish or lies behind the feed."""
+    x, y, z = here.point_mm.T
+    gap = z - (x**2 + y**2) / (4 * antenna.reflector.focal_length_mm)
+    if (gap <= 0).any():
+        raise InputError(
+            f"the subreflector would reach {-gap.min():.4g} mm into the dish; give it a shorter stroke, or a smaller foci_distance_mm"
+        )
+    if (z <= feed.center_mm[2]).any():
+        raise InputError("the subreflector would lie behind the feed's phase centre; give a larger foci_distance_mm or a shorter stroke")
+
+
+def _solve(matrix: Array, right: Array) -> Array:
+    """Solutions (N, 2, K) of two equations each: numpy's own loop is slow for so many small ones."""
+    (p, q), (r, s) = np.moveaxis(matrix, 0, -1)
+    inverse = np.stack([np.stack([s, -q], axis=-1), np.stack([-r, p], axis=-1)], axis=1)
+    return np.asarray(inverse @ right / (p * s - q * r)[:, None, None])

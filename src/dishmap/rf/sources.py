@@ -1,0 +1,109 @@
+"""Currents on the deformed dish, by physical optics: J = 2 n x H, H the magnetic field of the arriving ray.
+
+A source is a current times its area, with the path that its ray has come. Everything is relative to the feed's whole power, so that
+sums over sources give gain. Fields are in units in which power density is |E|^2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dishmap.errors import InputError
+from dishmap.rf.antenna import Antenna
+from dishmap.rf.aperture import ApertureNodes, aperture_nodes
+from dishmap.rf.correction import Correction
+from dishmap.rf.deformation import Deformation, displacement
+from dishmap.rf.rays import Rays, feed_place, trace
+from dishmap.rf.subreflector import rim_disc
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+LIGHT_MM_GHZ = 299.792458
+# Under so many wavelengths across, currents by physical optics are no longer those of the dish.
+LEAST_WAVELENGTHS = 3.0
+# Rings and spokes of the quadrature: for the illumination, for each radian of phase at the rim towards the widest direction wanted, and
+# for each degree of the deformation.
+RINGS, SPOKES = (24, 0.6, 1), (64, 1.3, 3)
+# Half the angular width of the beam is about this over the diameter in wavelengths.
+BEAM = 0.6
+
+
+@dataclass(frozen=True)
+class Sources:
+    """N currents times areas on the dish.
+
+    nodes: where they are, in nominal x and y; normal (N, 3): nominal unit normals; point_mm (N, 3); moment (N, 3): 2 n x H times area,
+    in mm^2 over distance; rays: that make them; arriving (N,): power that arrives at each, as a share of the feed's.
+    """
+
+    nodes: ApertureNodes
+    normal: Array
+    point_mm: Array
+    moment: Complex
+    rays: Rays
+    arriving: Array
+
+
+def wavelength_of(antenna: Antenna, frequency_ghz: float) -> float:
+    """Wavelength in mm. Raises InputError where the aperture is under 3 wavelengths across."""
+    if not (np.isfinite(frequency_ghz) and frequency_ghz > 0):
+        raise InputError(f"the frequency must be a positive number of GHz, not {frequency_ghz:g}")
+    wavelength = LIGHT_MM_GHZ / frequency_ghz
+    across = antenna.reflector.diameter_mm / wavelength
+    if across < LEAST_WAVELENGTHS:
+        lowest = LEAST_WAVELENGTHS * LIGHT_MM_GHZ / antenna.reflector.diameter_mm
+        raise InputError(
+            f"at {frequency_ghz:g} GHz the aperture is {across:.2g} wavelengths across, and physical optics needs {LEAST_WAVELENGTHS:g}; "
+            f"ask for {lowest:.3g} GHz or more"
+        )
+    return wavelength
+
+
+def sampled(antenna: Antenna, deformation: Deformation, wavelength_mm: float, widest: float = 0.0) -> ApertureNodes:
+    """Nodes fine enough for directions up to `widest` (sine of the angle from the boresight), at least for the main beam."""
+    widest = max(widest, 3 * BEAM * wavelength_mm / antenna.reflector.diameter_mm)
+    phase = np.pi * antenna.reflector.diameter_mm / wavelength_mm * widest
+    degree = max((n for n, _ in deformation.terms), default=0)
+    rings, spokes = (int(np.ceil(base + slope * phase + bent * degree)) for base, slope, bent in (RINGS, SPOKES))
+    return aperture_nodes(antenna, rings, spokes, shadow_radius_mm(antenna))
+
+
+def shadow_radius_mm(antenna: Antenna) -> float:
+    """Radius of the disc about the axis that is blocked: as given, or the subreflector's own where it is on the axis."""
+    if antenna.blockage.diameter_mm is not None:
+        return antenna.blockage.diameter_mm / 2
+    if antenna.subreflector is None:
+        return 0.0
+    center, radius = rim_disc(antenna.reflector, antenna.subreflector)
+    return radius if abs(center) < radius else 0.0
+
+
+def sources(antenna: Antenna, deformation: Deformation, correction: Correction, nodes: ApertureNodes) -> Sources:
+    """Currents on the deformed dish, after a correction. Raises InputError when the subreflector would reach the dish or the feed."""
+    points, area, normal = deformed_surface(antenna, deformation, nodes)
+    rays = trace(antenna, feed_place(antenna), points, correction)
+    moment = 2 * np.cross(area, np.cross(rays.direction, rays.field))
+    arriving = -(rays.direction * area).sum(axis=1) * (np.abs(rays.field) ** 2).sum(axis=1)
+    return Sources(nodes, normal, points, moment, rays, arriving)
+
+
+def deformed_surface(antenna: Antenna, deformation: Deformation, nodes: ApertureNodes) -> tuple[Array, Array, Array]:
+    """Points (N, 3), area vectors (N, 3) and nominal unit normals (N, 3) at the nodes: x0 + d n0, and the product of its derivatives."""
+    f = antenna.reflector.focal_length_mm
+    x, y = nodes.xy_mm.T
+    value, gradient = displacement(deformation, nodes.xy_mm)
+    stretch = np.sqrt(1 + (x**2 + y**2) / (4 * f**2))
+    normal = np.stack([-x / (2 * f), -y / (2 * f), np.ones_like(x)], axis=1) / stretch[:, None]
+    sides = []
+    for k, along in enumerate((x, y)):
+        side = np.zeros((len(x), 3))
+        side[:, k], side[:, 2] = 1.0, along / (2 * f)
+        turn = -normal * (along / (4 * f**2 * stretch**2))[:, None]
+        turn[:, k] -= 1 / (2 * f * stretch)
+        sides.append(side + gradient[:, k, None] * normal + value[:, None] * turn)
+    point = np.stack([x, y, (x**2 + y**2) / (4 * f)], axis=1) + value[:, None] * normal
+    return point, np.cross(sides[0], sides[1]) * nodes.weight_mm2[:, None], normal
