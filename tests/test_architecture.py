@@ -65,7 +65,7 @@ ORDER = [
     *("difference.outline", "difference.profile", "difference.circle", "difference.rimfit", "difference.rim"),
     # and as we have it: one estimate of everything that may have moved
     *("difference.response", "difference.changes", "difference.priors", "difference.model", "difference.joint"),
-    *("difference.estimate", "difference.difference_map", "difference.bound"),
+    *("difference.estimate", "difference.difference_map", "difference.saved", "difference.bound"),
     # photographs with truth
     *("simulate.deform", "simulate.scene", "simulate.forward", "simulate.truth", "simulate.contour", "simulate.grid_ink"),
     "simulate.render",
@@ -86,7 +86,7 @@ ORDER = [
     "io.pattern_file",
     "io.toml_file",
     *("io.scenario_pattern", "io.scenario_file", "io.truth_file", "io.points_file", "io.measurement_file", "io.results"),
-    *("io.difference_file", "io.difference_results", "io.board_file", "io.sheet_file"),
+    *("io.difference_file", "io.difference_map_file", "io.difference_results", "io.board_file", "io.sheet_file"),
     "io.antenna_file",
     # people: what a map says in words, in pictures, on a page
     *(

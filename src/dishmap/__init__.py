@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from dishmap.io.antenna_file import read_antenna
     from dishmap.io.camera_file import read_camera, write_camera
     from dishmap.io.difference_file import read_difference
+    from dishmap.io.difference_map_file import read_difference_map
     from dishmap.io.images import read_gray, read_turn_deg
     from dishmap.io.measurement_file import read_measurement, write_measurement
     from dishmap.io.pattern_file import read_pattern, write_pattern
@@ -100,6 +101,7 @@ _HOME = {
     "read_antenna": "dishmap.io.antenna_file",
     "read_camera": "dishmap.io.camera_file",
     "read_difference": "dishmap.io.difference_file",
+    "read_difference_map": "dishmap.io.difference_map_file",
     "read_gray": "dishmap.io.images",
     "read_measurement": "dishmap.io.measurement_file",
     "read_pattern": "dishmap.io.pattern_file",
@@ -160,6 +162,7 @@ __all__ = [
     "read_antenna",
     "read_camera",
     "read_difference",
+    "read_difference_map",
     "read_gray",
     "read_measurement",
     "read_pattern",

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from dishmap.compare import DifferenceTable
 from dishmap.io.camera_file import read_camera, write_camera
 from dishmap.io.difference_file import read_difference
+from dishmap.io.difference_map_file import read_difference_map
 from dishmap.io.pattern_file import read_pattern
 from dishmap.io.picture_file import picture_bytes
 from dishmap.io.pose_file import read_pose
@@ -50,7 +51,7 @@ motion = { rotation_vector_deg = [0.05, -0.03, 0.02], translation_mm = [0.2, -0.
 FARTHEST_SIGMAS = 3.0
 # What the table rounds to, with the rms of 20 rows.
 ROUNDING_MM = 2e-6
-FILES = {"difference.csv", "difference.ply", "surface.json", "summary.json", "report.html"}
+FILES = {"difference.csv", "difference.npz", "difference.ply", "surface.json", "summary.json", "report.html"}
 
 
 @pytest.fixture(scope="module")
@@ -313,10 +314,26 @@ def test_frames_of_one_state_are_averaged(shots: Path, compared: tuple[Path, Res
     assert all(path.is_file() for path in (tmp_path / "out").iterdir())
 
 
+def test_the_covariance_is_that_of_the_table(compared: tuple[Path, Result]) -> None:
+    folder = compared[0] / "bent"
+    table, saved = read_difference(folder / "difference.csv"), read_difference_map(folder / "difference.npz")
+    assert saved.ids.tolist() == table.ids.tolist()
+    assert np.abs(saved.shape_mm - table.shape_mm).max() < ROUNDING_MM
+    for factor, own, sigma in (
+        (saved.shape_factor, saved.shape_own_mm2, table.sigma_shape_mm),
+        (saved.displacement_factor, saved.displacement_own_mm2, table.sigma_displacement_mm),
+    ):
+        # the table keeps 6 digits
+        assert np.allclose(np.sqrt((factor**2).sum(axis=1) + own), sigma, rtol=1e-5, atol=0)
+
+
 def test_the_paper_s_method_alone(shots: Path, compared: tuple[Path, Result], tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "difference.npz").write_text("of an earlier run")
     done = diff(shots, "ref", "bent", tmp_path / "out", "--upright", "--method", "paper")
     assert done.exit_code == 0, done.stderr
     assert (tmp_path / "out" / "difference.csv").read_text() == (compared[0] / "bent" / "difference_paper.csv").read_text()
+    assert not (tmp_path / "out" / "difference.npz").exists()
     assert "not known" in done.stdout
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["joint"], summary["apart"], summary["paper"]["centers"]) == (None, None, "paper")

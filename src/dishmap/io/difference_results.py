@@ -16,9 +16,11 @@ import numpy as np
 from dishmap.compare import DISPLACEMENT, JOINT, PAPER, SHAPE, Difference
 from dishmap.difference.difference_map import DifferenceMap
 from dishmap.difference.paper import PaperDifference
+from dishmap.difference.saved import saved_difference
 from dishmap.figures import apart, distance_mm, figures_of
 from dishmap.io.atomic import write_files
 from dishmap.io.difference_file import format_difference, format_difference_ply
+from dishmap.io.difference_map_file import DIFFERENCE_FILE, difference_bytes
 from dishmap.io.pose_file import pose_content
 from dishmap.io.results import SURFACE_FORMAT, camera_content, hint_content, json_text, sha256_of, surface_content, versions
 from dishmap.quality import Quality
@@ -63,17 +65,19 @@ def difference_files(result: Difference, provenance: DifferenceProvenance) -> di
             "surface.json": _surface_text(result, method),
         }
         files |= {BESIDE[name] if place else name: text for name, text in own.items()}
+    if result.joint is not None:
+        files[DIFFERENCE_FILE] = difference_bytes(saved_difference(result.joint, result.pattern))
     return {**files, "summary.json": difference_summary(result, provenance)}
 
 
 def write_difference(folder: str | Path, files: Mapping[str, str | bytes]) -> None:
     """Write the files of a difference into an existing folder, all or none.
 
-    What the paper's method left there beside an earlier difference is removed when this one has none. Raises InputError when a file
-    cannot be written.
+    What another method left there of an earlier difference is removed when this one has none. Raises InputError when a file cannot be
+    written.
     """
     write_files(folder, files)
-    for name in BESIDE.values():
+    for name in (*BESIDE.values(), DIFFERENCE_FILE):
         if name not in files:
             with suppress(FileNotFoundError):
                 (Path(folder) / name).unlink()
