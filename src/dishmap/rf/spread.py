@@ -1,0 +1,131 @@
+"""What the map's uncertainty does to gain and beam: the figures of surfaces drawn from it.
+
+A drawn surface differs from the mean one by so little that its paths are linear in the difference: a rise along the normal changes the
+path by the normal times (arriving direction - departing direction), exactly so to the first order (Fermat). Fields are not linear: gain
+is stationary at a perfect surface, so that an uncertain map always costs some.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dishmap.rf.beam import CUTS_DEG, Beam, cut_angles_rad, cut_directions, cut_figures, log_gain_slopes
+from dishmap.rf.deformation import Deformation
+from dishmap.rf.feed import ludwig_axes, polarization_axes
+from dishmap.rf.gain import path_towards, ruze_loss_db
+from dishmap.rf.pattern import decibels
+from dishmap.rf.sources import Sources
+from dishmap.surface.zernike import zernike_matrix
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+NEWTON_STEPS = 8
+NAMES = (
+    *("gain_dbi", "boresight_dbi", "u", "v", "width_0_deg", "width_90_deg", "sidelobe_0_db", "sidelobe_90_db"),
+    *("weighted_rms_mm", "ruze_db"),
+)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Figures (K, len(NAMES)) of K drawn surfaces."""
+
+    draws: Array
+
+    def of(self, name: str) -> Array:
+        """All draws (K,) of one figure."""
+        return np.asarray(self.draws[:, NAMES.index(name)])
+
+    def sigma(self, name: str) -> float:
+        """Standard deviation of one figure, of the draws that have it."""
+        return float(np.nanstd(self.of(name))) if np.isfinite(self.of(name)).any() else float("nan")
+
+    def interval(self, name: str) -> tuple[float, float]:
+        """The middle 95 % of one figure."""
+        if not np.isfinite(self.of(name)).any():
+            return float("nan"), float("nan")
+        low, high = np.nanpercentile(self.of(name), [2.5, 97.5])
+        return float(low), float(high)
+
+
+def spread(
+    sources: Sources,
+    deformation: Deformation,
+    drawn_mm: Array,
+    beam: Beam,
+    wavelength_mm: float,
+    diameter_mm: float,
+    polarization: str,
+) -> Spread:
+    """Figures of surfaces with coefficients drawn_mm (K, T), near the deformation of which sources and beam were made."""
+    k = 2 * np.pi / wavelength_mm
+    middle = _direction(beam.u, beam.v)
+    co_axis = polarization_axes(polarization, 1, *ludwig_axes(middle[None]))[0][0]
+    wave = (sources.moment @ co_axis.conj()) * np.exp(1j * k * (sources.point_mm @ middle - sources.rays.path_mm))
+    x, y = ((sources.nodes.xy_mm - deformation.center_mm) / deformation.radius_mm).T
+    rise = zernike_matrix(deformation.terms, x, y) @ (drawn_mm - deformation.coefficients_mm).T
+    change = (sources.normal * (sources.rays.direction - middle)).sum(axis=1)[:, None] * rise
+    waves = wave[:, None] * np.exp(-1j * k * change)
+    peaks = np.array([_peak(waves[:, d], sources.point_mm, k, beam) for d in range(waves.shape[1])])
+    reference = abs(wave.sum()) ** 2
+    at_boresight = _towards(waves, sources.point_mm, k, middle, np.zeros((1, 2)))[0]
+    bore = beam.gain_dbi + decibels(np.abs(at_boresight) ** 2 / reference)
+    cuts = _cut_figures(waves, sources.point_mm, k, beam, wavelength_mm, diameter_mm)
+    rms = _weighted_rms(sources, beam, change, peaks)
+    ruze = np.array([ruze_loss_db(value, wavelength_mm) for value in rms])
+    gain = beam.gain_dbi + decibels(peaks[:, 2] / reference)
+    return Spread(np.column_stack([gain, bore, peaks[:, :2], cuts, rms, ruze]))
+
+
+def _direction(u: float, v: float) -> Array:
+    return np.array([u, v, np.sqrt(1 - u**2 - v**2)])
+
+
+def _peak(wave: Complex, points: Array, k: float, beam: Beam) -> tuple[float, float, float]:
+    """Direction and power of the peak of one drawn surface, from waves (N,) towards the mean surface's peak."""
+    middle = _direction(beam.u, beam.v)
+    u, v = beam.u, beam.v
+    for _ in range(NEWTON_STEPS):
+        here = _direction(u, v)
+        now = wave * np.exp(1j * k * (points @ (here - middle)))
+        slopes = [points[:, i] - points[:, 2] * at / here[2] for i, at in enumerate((u, v))]
+        gradient, hessian = log_gain_slopes(now, k, *slopes)
+        values, vectors = np.linalg.eigh(hessian)
+        step = vectors @ ((vectors.T @ gradient) / np.maximum(np.abs(values), 1e-300))
+        u, v = u + step[0], v + step[1]
+        if np.hypot(*step) < 1e-9:
+            break
+    return u, v, float(abs(now.sum()) ** 2)
+
+
+def _towards(waves: Complex, points: Array, k: float, middle: Array, uv: Array) -> Complex:
+    """Fields (D, K) of waves (N, K) towards directions (D, 2), which the waves have towards `middle`."""
+    direction = np.column_stack([uv, np.sqrt(1 - (uv**2).sum(axis=1))])
+    return np.asarray(np.exp(1j * k * ((direction - middle) @ points.T)) @ waves)
+
+
+def _cut_figures(waves: Complex, points: Array, k: float, beam: Beam, wavelength_mm: float, diameter_mm: float) -> Array:
+    """Widths in degrees and sidelobes in dB (K, 4) in the principal cuts through the mean surface's peak."""
+    angles = cut_angles_rad(wavelength_mm, diameter_mm)
+    middle = _direction(beam.u, beam.v)
+    widths, lobes = [], []
+    for phi in CUTS_DEG:
+        power = decibels(np.abs(_towards(waves, points, k, middle, cut_directions(beam.u, beam.v, phi, angles))) ** 2)
+        figures = np.array([cut_figures(angles, column) for column in power.T])
+        widths.append(np.degrees(figures[:, 0]))
+        lobes.append(figures[:, 1])
+    return np.column_stack([*widths, *lobes])
+
+
+def _weighted_rms(sources: Sources, beam: Beam, change: Array, peaks: Array) -> Array:
+    """Illumination-weighted rms half-path error (K,), each at its own peak (K, 3), for changes of the path (N, K)."""
+    lit = slice(0, sources.nodes.lit)
+    weight = np.sqrt(np.maximum(sources.arriving[lit] * sources.nodes.weight_mm2[lit], 0.0))
+    turned = np.stack([_direction(u, v) for u, v in peaks[:, :2]], axis=1) - _direction(beam.u, beam.v)[:, None]
+    path = path_towards(sources, beam.u, beam.v)[lit, None] + change[lit] - sources.point_mm[lit] @ turned
+    half = path / 2 - weight @ path / 2 / weight.sum()
+    return np.asarray(np.sqrt(weight @ half**2 / weight.sum()))
