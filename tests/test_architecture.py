@@ -77,7 +77,7 @@ ORDER = [
     # from surface to signal
     *("rf.antenna", "rf.pattern", "rf.deformation"),
     *("rf.aperture", "rf.feed", "rf.correction", "rf.subreflector", "rf.rays", "rf.sources", "rf.farfield"),
-    *("rf.beam", "rf.gain", "rf.best_fit", "rf.spread"),
+    *("rf.beam", "rf.gain", "rf.best_fit", "rf.spread", "rf.state"),
     # paper to print
     *("sheet.shapes", "sheet.pdf", "sheet.svg", "sheet.flatten", "sheet.pieces", "sheet.outline", "sheet.ruled"),
     *("sheet.seams", "sheet.gores", "sheet.markers"),

@@ -104,7 +104,8 @@ def cut_directions(u: float, v: float, phi_deg: float, angle_rad: Array) -> Arra
     along = np.array([np.cos(np.radians(phi_deg)), np.sin(np.radians(phi_deg)), 0.0])
     along = along - (along @ middle) * middle
     along /= np.linalg.norm(along)
-    return np.asarray(np.cos(angle_rad)[:, None] * middle[:2] + np.sin(angle_rad)[:, None] * along[:2])
+    way: Array = np.cos(angle_rad)[:, None] * middle[:2] + np.sin(angle_rad)[:, None] * along[:2]
+    return way
 
 
 def cut_figures(angle_rad: Array, power_db: Array) -> tuple[float, float]:
