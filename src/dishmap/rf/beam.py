@@ -95,7 +95,7 @@ def cut_angles_rad(wavelength_mm: float, diameter_mm: float) -> Array:
     """Angles of a cut through the peak, from one side to the other; the middle one is zero."""
     unit = min(wavelength_mm / diameter_mm, np.pi / 2 / CUT_REACH * 0.95)
     count = round(CUT_REACH / CUT_STEP)
-    return np.arange(-count, count + 1) * CUT_STEP * unit
+    return np.asarray(np.arange(-count, count + 1) * CUT_STEP * unit)
 
 
 def cut_directions(u: float, v: float, phi_deg: float, angle_rad: Array) -> Array:
