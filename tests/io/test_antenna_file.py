@@ -4,13 +4,26 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from dishmap.errors import InputError
 from dishmap.io.antenna_file import format_antenna, parse_antenna, read_antenna
-from dishmap.rf.antenna import FEED_KINDS, POLARIZATIONS, SUBREFLECTOR_KINDS, Actuators, Antenna, Blockage, Feed, Reflector, Subreflector
+from dishmap.io.grasp_pattern import cuts_of, format_cuts
+from dishmap.rf.antenna import (
+    FEED_KINDS,
+    POLARIZATIONS,
+    SUBREFLECTOR_KINDS,
+    Actuators,
+    Antenna,
+    Blockage,
+    CutTable,
+    Feed,
+    Reflector,
+    Subreflector,
+)
 
 EXAMPLES = sorted((Path(__file__).resolve().parents[2] / "examples").glob("antenna-*.toml"))
 
@@ -68,6 +81,41 @@ def test_the_examples_read_back(path: Path) -> None:
     assert parse_antenna(format_antenna(antenna)) == antenna
 
 
+def horn() -> CutTable:
+    """A feed that falls off, with some cross-polarisation between the axes."""
+    theta, phi = np.arange(0.0, 91.0, 10.0), np.arange(0.0, 360.0, 45.0)
+    co = np.tile(np.cos(np.radians(theta)) ** 3 * (1 + 0.5j), (len(phi), 1))
+    return CutTable(theta, phi, co, 0.01 * np.sin(2 * np.radians(phi))[:, None] * co)
+
+
+def test_a_feed_from_a_file_beside_it(tmp_path: Path) -> None:
+    antenna = Antenna(Reflector(600.0, 300.0), Feed("cut", polarization="right", table=horn()))
+    (tmp_path / "my horn.cut").write_text(format_cuts(cuts_of(horn())))
+    (tmp_path / "antenna.toml").write_text(format_antenna(antenna, "my horn.cut"))
+    back = read_antenna(tmp_path / "antenna.toml")
+    assert back.feed.polarization == "right"
+    assert back.feed.table is not None
+    for name in ("theta_deg", "phi_deg", "co", "cross"):
+        # 11 digits in the file
+        assert np.abs(getattr(back.feed.table, name) - getattr(horn(), name)).max() < 1e-8
+    (tmp_path / "my horn.cut").write_text(format_cuts(cuts_of(horn())[:1]))
+    with pytest.raises(InputError, match=r"antenna\.toml: \[feed\] .*my horn\.cut: a feed needs three or more azimuths"):
+        read_antenna(tmp_path / "antenna.toml")
+    (tmp_path / "my horn.cut").unlink()
+    with pytest.raises(InputError, match=r"antenna\.toml: \[feed\] cannot read the cut file .*my horn\.cut: No such file"):
+        read_antenna(tmp_path / "antenna.toml")
+
+
+def test_every_commented_key_of_the_example_is_valid(tmp_path: Path) -> None:
+    text = next(path for path in EXAMPLES if "prime" in path.stem).read_text()
+    (tmp_path / "feed.cut").write_text(format_cuts(cuts_of(horn())))
+    without = text.replace("edge_taper_db = 12 ", "# edge_taper_db = 12 ")
+    cosine = parse_antenna(without.replace('kind = "gaussian"', 'kind = "cosine"').replace("# exponent", "exponent"))
+    assert (cosine.feed.kind, cosine.feed.exponent) == ("cosine", 4)
+    cut = parse_antenna(without.replace('kind = "gaussian"', 'kind = "cut"').replace("# file", "file"), tmp_path)
+    assert cut.feed.table is not None
+
+
 lengths = st.floats(1e-3, 1e5)
 
 
@@ -113,6 +161,8 @@ def test_any_antenna_reads_back_equal(antenna: Antenna) -> None:
         ("diameter_mm = 600", "diameter_mm = -600", r"^dish.toml: \[reflector\] the diameter of the reflector must be a positive number"),
         ('"cassegrain"', '"casegrain"', r"\[subreflector\] unknown subreflector 'casegrain'; the nearest is 'cassegrain'"),
         ("edge_taper_db = 12", "", r"\[feed\] a gaussian feed needs edge_taper_db and nothing else, not nothing"),
+        ("edge_taper_db = 12", 'kind = "cut"', r"\[feed\] kind = 'cut' and file .* go together"),
+        ("edge_taper_db = 12", 'edge_taper_db = 12\nfile = "a.cut"', r"\[feed\] kind = 'cut' and file .* go together"),
         ("edge_taper_db = 12", "edge_taper_db = -12", r"\[feed\] the edge taper must be a positive number of dB"),
         ("magnification = 4", "magnification = 0.5", r"\[subreflector\] the magnification"),
         ("foci_distance_mm = 220", "foci_distance_mm = 2200", "^dish.toml: the subreflector's vertex would lie at z = .* behind"),
@@ -128,7 +178,7 @@ def test_any_antenna_reads_back_equal(antenna: Antenna) -> None:
 def test_mistakes_are_named(old: str, new: str, message: str) -> None:
     assert old in SMALL
     with pytest.raises(InputError, match=message) as caught:
-        parse_antenna(SMALL.replace(old, new), "dish.toml")
+        parse_antenna(SMALL.replace(old, new), source="dish.toml")
     assert "\n" not in str(caught.value) or "TOML" in str(caught.value)
 
 

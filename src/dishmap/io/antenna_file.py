@@ -5,15 +5,18 @@ Lengths are in millimetres, angles in degrees, tapers in dB.
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, BeforeValidator, Field
 
 from dishmap.errors import InputError
+from dishmap.io.grasp_pattern import cut_table, read_cuts
 from dishmap.io.toml_file import STRICT, checked, toml_content, toml_text
 from dishmap.rf.antenna import Actuators, Antenna, Blockage, Feed, Reflector, Subreflector
 
@@ -51,6 +54,7 @@ class FeedModel(_Model):
     edge_taper_db: float | None = None
     exponent: float | None = None
     polarization: str = Feed.polarization
+    file: str | None = None
 
 
 class SubreflectorModel(_Model):
@@ -93,25 +97,29 @@ class AntennaModel(_Model):
 
 def read_antenna(path: str | os.PathLike[str]) -> Antenna:
     """Read an antenna file and the file of its feed. Raises InputError, naming the file and what is wrong in it."""
-    return parse_antenna(toml_text(path, "antenna file"), str(path))
+    return parse_antenna(toml_text(path, "antenna file"), Path(path).parent, str(path))
 
 
-def parse_antenna(text: str, source: str = "the antenna") -> Antenna:
-    """Make an Antenna of the text of an antenna file; `source` stands in messages. Raises InputError."""
+def parse_antenna(text: str, folder: str | os.PathLike[str] = ".", source: str = "the antenna") -> Antenna:
+    """Make an Antenna of the text of an antenna file, whose feed's file is found in `folder`. Raises InputError."""
     model = checked(toml_content(text, source), AntennaModel, source)
     try:
-        return _antenna(model)
+        return _antenna(model, Path(folder))
     except InputError as error:
         raise type(error)(f"{source}: {error}") from error
 
 
-def format_antenna(antenna: Antenna) -> str:
-    """The text of an antenna file, which reads back as the same antenna."""
+def format_antenna(antenna: Antenna, feed_file: str = "feed.cut") -> str:
+    """The text of an antenna file, which reads back as the same antenna.
+
+    feed_file: name, beside it, of the .cut file of a feed that is a table (`dishmap.io.grasp_pattern.cuts_of`), which is not written here.
+    """
     feed = antenna.feed
+    words = {"kind": feed.kind, "polarization": feed.polarization, **({} if feed.table is None else {"file": feed_file})}
     parts = [
         f'format = "{FORMAT}"\n',
         _table("reflector", **asdict(antenna.reflector)),
-        _table("feed", kind=feed.kind, edge_taper_db=feed.edge_taper_db, exponent=feed.exponent, polarization=feed.polarization),
+        _table("feed", **words, edge_taper_db=feed.edge_taper_db, exponent=feed.exponent),
         *([] if antenna.subreflector is None else [_table("subreflector", **asdict(antenna.subreflector))]),
         _table("blockage", **asdict(antenna.blockage)),
         _table("actuators", **asdict(antenna.actuators)),
@@ -129,20 +137,20 @@ def _table(name: str, **values: Value) -> str:
 
 def _toml(value: Value) -> str:
     if isinstance(value, str):
-        return f'"{value}"'
+        return json.dumps(value, ensure_ascii=False)
     if isinstance(value, tuple):
         return f"[{', '.join(map(_toml, value))}]"
     # numpy's numbers print their type
     return repr(value if isinstance(value, int) else float(value or 0))
 
 
-def _antenna(model: AntennaModel) -> Antenna:
+def _antenna(model: AntennaModel, folder: Path) -> Antenna:
     main, moves = model.reflector, model.actuators
     with _within("reflector"):
         reflector = Reflector(main.diameter_mm, main.focal_length_mm, main.offset_mm)
         _check_units(reflector)
     with _within("feed"):
-        feed = Feed(model.feed.kind, model.feed.edge_taper_db, model.feed.exponent, model.feed.polarization)
+        feed = _feed(model.feed, folder)
     with _within("subreflector"):
         subreflector = None if model.subreflector is None else Subreflector(**model.subreflector.model_dump())
     with _within("blockage"):
@@ -152,6 +160,13 @@ def _antenna(model: AntennaModel) -> Antenna:
         about_x, about_y = moves.tilt_deg
         actuators = Actuators((x, y, z), (about_x, about_y), moves.shape_degree, moves.shape_stroke_mm)
     return Antenna(reflector, feed, subreflector, blockage, actuators)
+
+
+def _feed(model: FeedModel, folder: Path) -> Feed:
+    if (model.file is None) == (model.kind == "cut"):
+        raise InputError("kind = 'cut' and file (a GRASP .cut file beside this one) go together, and no other kind has a file")
+    table = None if model.file is None else cut_table(read_cuts(folder / model.file), str(folder / model.file))
+    return Feed(model.kind, model.edge_taper_db, model.exponent, model.polarization, table)
 
 
 @contextmanager

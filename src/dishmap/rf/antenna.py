@@ -61,7 +61,8 @@ class Reflector:
 class CutTable:
     """A feed measured or computed elsewhere: Ludwig-3 far field at angles theta (T,) from its axis and azimuths phi (P,).
 
-    theta_deg rises from 0; phi_deg rises within [0, 360). co, cross (P, T): complex fields on any common scale.
+    theta_deg rises from 0; phi_deg rises within [0, 360). co, cross (P, T): complex fields along Ludwig's x and y, whatever the feed's
+    polarisation, on any common scale.
     """
 
     theta_deg: Array

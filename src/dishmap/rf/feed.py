@@ -65,11 +65,11 @@ def radiated(field: FeedField, direction: Array) -> Complex:
         phi = first + np.mod(np.arctan2(direction[:, 1], direction[:, 0]) - first, 2 * np.pi)
         parts = [spline.ev(phi, theta) for spline in field.splines]
         inside = theta <= np.radians(field.feed.table.theta_deg[-1])
+        # a table says itself how the feed is polarised
         co, cross = inside * (parts[0] + 1j * parts[1]), inside * (parts[2] + 1j * parts[3])
-    else:
-        co, cross = _profile(field, direction[:, 2]).astype(complex), np.zeros(len(direction), complex)
-    co_axis, cross_axis = polarization_axes(field.feed.polarization, field.hand, along_x, along_y)
-    return np.asarray(field.scale * (co[:, None] * co_axis + cross[:, None] * cross_axis))
+        return np.asarray(field.scale * (co[:, None] * along_x + cross[:, None] * along_y))
+    co_axis, _ = polarization_axes(field.feed.polarization, field.hand, along_x, along_y)
+    return np.asarray(field.scale * _profile(field, direction[:, 2])[:, None] * co_axis)
 
 
 def ludwig_axes(direction: Array) -> tuple[Array, Array]:
