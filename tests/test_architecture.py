@@ -108,6 +108,8 @@ ORDER = [
     *("difference_report",),
     # and what a plan says
     *("planning_verdict", "planning_report", "io.plan_file"),
+    # and what an antenna's gain says
+    *("plot.rf_maps", "plot.rf_pattern", "plot.rf_bars", "plot.rf_antenna"),
     # the program
     *("cli.terminal", "cli.options", "cli.prior_options", "cli.outcome", "cli.difference_outcome"),
     *("cli.board_options", "cli.calibrate", "cli.pattern", "cli.sheet", "cli.plan", "cli.simulate", "cli.undistort"),

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colorbar import Colorbar
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -65,9 +66,7 @@ def sigma_map(xy_mm: Array, sigma: Array, label: str) -> Figure:
     dots = axes.scatter(xy_mm[:, 0], xy_mm[:, 1], c=sigma, cmap=SEQUENTIAL, norm=norm, zorder=3, **marks(xy_mm, 26))
     bar = figure.colorbar(dots, ax=axes, label=label)
     if isinstance(norm, LogNorm):
-        # plain numbers instead of powers of ten
-        bar.set_ticks(ticks := _ticks(float(norm.vmin or 0), float(norm.vmax or 0)), labels=[f"{tick:g}" for tick in ticks], minor=False)
-        bar.minorticks_off()
+        plain_ticks(bar, norm)
     dish_axes(axes, xy_mm)
     return figure
 
@@ -161,6 +160,12 @@ def map_figure(xy_mm: Array, body_in: float = MAP_BODY_IN) -> tuple[Figure, Axes
     """A figure of the height that the points' outline needs, `body_in` for a square one."""
     along, across = np.ptp(xy_mm, axis=0) + 2 * MARGIN * _span(xy_mm)
     return new_figure(MAP_WIDTH_IN, float(np.clip(body_in * across / along, *MAP_HEIGHTS_IN)) + 0.9, "compressed")
+
+
+def plain_ticks(bar: Colorbar, norm: LogNorm) -> None:
+    """Plain numbers instead of powers of ten beside logarithmic colours."""
+    bar.set_ticks(ticks := _ticks(float(norm.vmin or 0), float(norm.vmax or 0)), labels=[f"{tick:g}" for tick in ticks], minor=False)
+    bar.minorticks_off()
 
 
 def _ticks(low: float, high: float) -> list[float]:
