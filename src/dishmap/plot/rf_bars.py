@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -27,7 +28,7 @@ def mode_bars(names: Sequence[str], states: Sequence[str], loss_db: Array, sigma
         place = np.arange(len(names)) + (k - (len(states) - 1) / 2) * thick
         axes.barh(place, loss_db[k], color=style_of(state)["color"], height=0.92 * thick, label=state)
         known = np.isfinite(sigma_db[k])
-        bars = {"fmt": "none", "ecolor": INK, "elinewidth": 1.1, "capsize": 2.0}
+        bars: dict[str, Any] = {"fmt": "none", "ecolor": INK, "elinewidth": 1.1, "capsize": 2.0}
         axes.errorbar(loss_db[k][known], place[known], xerr=sigma_db[k][known], label="one sigma" if k == 0 else None, **bars)
     axes.axvline(0.0, color="#666666", linewidth=0.8)
     axes.set_yticks(np.arange(len(names)), names, fontsize=9.5)
@@ -44,14 +45,8 @@ def margin_curves(error_mm: Array, left_db: dict[str, Array], own_mm: float) -> 
     for name, left in left_db.items():
         axes.plot(error_mm, np.maximum(left, LEAST_DB), marker="o", markersize=3.5, label=name, **STYLES.get(name, OTHER_STYLE))
     axes.axvline(own_mm, color=INK, linewidth=1.0, linestyle="--")
-    axes.annotate(
-        f"this map: {own_mm:.2g} mm",
-        (own_mm, 0.97),
-        xycoords=("data", "axes fraction"),
-        xytext=(5, 0),
-        textcoords="offset points",
-        va="top",
-    )
+    at: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "xytext": (5, 0), "textcoords": "offset points", "va": "top"}
+    axes.annotate(f"this map: {own_mm:.2g} mm", (own_mm, 0.97), **at)
     axes.set(xscale="log", yscale="log", xlabel="rms error of the map (mm, one sigma)", ylabel="gain left on the table (dB)")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

@@ -54,7 +54,7 @@ def sigma_field(xy_mm: Array, sigma_mm: Array, beyond: Bools, targets_mm: Array,
     _field(axes, _raster(xy_mm, sigma_mm, center_mm, radius_mm), center_mm, radius_mm, norm, SEQUENTIAL)
     _hatch(axes, _raster(xy_mm, beyond.astype(float), center_mm, radius_mm), center_mm, radius_mm)
     area = max(DOT_AREA_PT2 * min(1.0, ROOMY_COUNT / max(len(targets_mm), 1)), SMALLEST_DOT_PT2)
-    axes.scatter(*targets_mm.T, s=area, color="white", edgecolors=INK, linewidths=0.4, zorder=4)
+    axes.scatter(targets_mm[:, 0], targets_mm[:, 1], s=area, color="white", edgecolors=INK, linewidths=0.4, zorder=4)
     bar = figure.colorbar(ScalarMappable(norm, SEQUENTIAL), ax=axes, label=label)
     if isinstance(norm, LogNorm):
         plain_ticks(bar, norm)
