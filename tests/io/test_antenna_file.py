@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dishmap.errors import InputError
-from dishmap.io.antenna_file import format_antenna, parse_antenna, read_antenna
+from dishmap.io.antenna_file import AntennaModel, format_antenna, parse_antenna, read_antenna
 from dishmap.io.grasp_pattern import cuts_of, format_cuts
 from dishmap.rf.antenna import (
     FEED_KINDS,
@@ -73,6 +74,14 @@ def test_the_examples_are_valid() -> None:
     assert by_name["shape-changing"].actuators.shape_degree == 6
     kinds = [by_name[name].subreflector for name in SUBREFLECTOR_KINDS]
     assert [sub.kind for sub in kinds if sub] == list(SUBREFLECTOR_KINDS)
+
+
+def test_the_page_names_every_key() -> None:
+    page = (EXAMPLES[0].parents[1] / "docs" / "rf-files.md").read_text()
+    for name, table in AntennaModel.model_fields.items():
+        model = next((part for part in (table.annotation, *get_args(table.annotation)) if hasattr(part, "model_fields")), None)
+        assert f"`[{name}]`" in page or (name == "format" and model is None)
+        assert all(f"`{key}`" in page for key in (model.model_fields if model else []))
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)

@@ -31,7 +31,8 @@ def grids() -> list[list[PatternGrid]]:
 def cuts() -> list[list[list[Cut]]]:
     theta = np.linspace(-3, 3, 7)
     return [
-        [[Cut(theta / f, phi, s + f * phi * np.exp(1j * theta), 1j * phi - s * theta) for phi in (0.0, 45.0, 90.0)] for f in (1, 2)] for s in (1, 2)
+        [[Cut(theta / f, phi, s + f * phi * np.exp(1j * theta), 1j * phi - s * theta) for phi in (0.0, 45.0, 90.0)] for f in (1, 2)]
+        for s in (1, 2)
     ]
 
 
