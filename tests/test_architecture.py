@@ -76,6 +76,7 @@ ORDER = [
     "planning",
     # from surface to signal
     *("rf.antenna", "rf.pattern", "rf.deformation"),
+    *("rf.smooth_terms", "rf.smooth_fit", "rf.shape_field", "rf.shape_sources"),
     *("rf.aperture", "rf.feed", "rf.correction", "rf.subreflector", "rf.rays", "rf.sources", "rf.farfield"),
     *("rf.beam", "rf.gain", "rf.best_fit", "rf.spread", "rf.state"),
     # paper to print
