@@ -103,6 +103,15 @@ def test_components_are_those_of_vectors(icomp: int, moment: Complex) -> None:
             assert found == pytest.approx((field * axis).sum(axis=1), abs=1e-12)
 
 
+def test_a_third_component_is_that_of_a_near_field() -> None:
+    text = "both\n0 1 2 0 3 1 3\n1 2 3 4 {} 0\n5 6 7 8 0 1e-12\n"
+    (cut,) = parse_cuts(text.format("1e-6"))
+    assert cut.co.tolist() == [1 + 2j, 5 + 6j]
+    assert cut.cross.tolist() == [3 + 4j, 7 + 8j]
+    with pytest.raises(InputError, match="line 4: the third component, along the ray, is not small: this is a near field"):
+        parse_cuts(text.format("0.5"), "c")
+
+
 def test_a_huygens_source_has_no_cross_polarisation() -> None:
     theta = np.arange(-90.0, 91.0, 15.0)
     lines = []
@@ -263,7 +272,7 @@ def test_whole_grids_are_written_without_limits_of_rows() -> None:
     [
         ("   1   3   2   1", "   1   3   2   7", "^g.grd, line 7: IGRID is 7, and only 1"),
         ("   1   3   2   1", "   1   9   2   1", "ICOMP is 9; 1 "),
-        ("   1   3   2   1", "   1   3   3   1", "NCOMP is 3, and only far fields"),
+        ("   1   3   2   1", "   1   3   4   1", "NCOMP is 4, and fields of 2 components"),
         ("   1   3   2   1", "   2000000000   3   2   1", "line 7: 2000000000 numbers .NSET. are announced, and the rest"),
         ("++++\n   1\n", "++++\n   2\n", "KTYPE is 2"),
         ("++++", "----", "^g.grd ends after 16 lines, where a line .* should follow"),
@@ -272,6 +281,7 @@ def test_whole_grids_are_written_without_limits_of_rows() -> None:
         ("   3   2   0", "   3   2   5", "KLIMIT 0 or 1, not 3, 2 and 5"),
         ("   3   2   0", "   3   2.5   0", "must be whole numbers"),
         ("   3   2   0", "   3   2   1", "line 13: more follows than the file announces"),
+        ("   1   0\n", "   1000   0\n", "line 10: u from 99.9 to 100.1 and v from -0.2 to 0.2 are no direction cosines"),
         ("0.2000000000E+01", "NaN", "line 12: 'NaN' is no finite number"),
         ("0.2000000000E+01", "abc", "line 12: 'abc' is no number"),
         ("0.6000000000E+01  0.5000000000E+00  0.0000000000E+00  0.0000000000E+00\n", "", "ends after 16 lines, where 4 more of 12 numbers"),
@@ -288,7 +298,7 @@ def test_grids_that_are_not_read(old: str, new: str, message: str) -> None:
     [
         ("3    1    2", "3    2    2", "^c.cut, line 2: ICUT is 2, and only polar cuts"),
         ("3    1    2", "5    1    2", "line 2: ICOMP is 5"),
-        ("3    1    2", "3    1    3", "line 2: NCOMP is 3"),
+        ("3    1    2", "3    1    1", "line 2: NCOMP is 1"),
         ("3    1    2", "3    1", "line 2: V_INI V_INC V_NUM C ICOMP ICUT NCOMP are needed .7 numbers., not"),
         ("E+01    3 ", "E+01    3000000000 ", "12000000000 numbers .* are announced"),
         ("E+01    3 ", "E+01    -3 ", "V_NUM -3"),

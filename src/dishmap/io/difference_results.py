@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -19,6 +16,7 @@ from dishmap.difference.paper import PaperDifference
 from dishmap.difference.saved import saved_difference
 from dishmap.figures import apart, distance_mm, figures_of
 from dishmap.io.atomic import write_files
+from dishmap.io.csv_table import format_csv
 from dishmap.io.difference_file import format_difference, format_difference_ply
 from dishmap.io.difference_map_file import DIFFERENCE_FILE, difference_bytes
 from dishmap.io.pose_file import pose_content
@@ -207,17 +205,4 @@ def failed_row(state: str, photographs: Sequence[str | Path], method: str, probl
 
 def format_states(rows: Sequence[Mapping[str, Any]]) -> str:
     """The text of `summary.csv`: one row a state; a cell is empty where a method does not give it."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(STATE_COLUMNS)
-    for row in rows:
-        writer.writerow([_cell(row.get(name)) for name in STATE_COLUMNS])
-    return out.getvalue()
-
-
-def _cell(value: Any) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return "" if math.isnan(value) else f"{value + 0.0:.9g}"
-    return "" if value is None else str(value)
+    return format_csv(STATE_COLUMNS, rows)

@@ -28,6 +28,10 @@ THETA_PHI, CIRCULAR, LUDWIG = 1, 2, 3
 TOLERANCE = 1e-8
 # Two cuts in one direction are of one field when they differ by less than this share of the greatest field.
 SAME_FIELD = 1e-4
+# A far field may have a third component in its file, along the ray, up to this share of the others.
+RADIAL = 1e-3
+# Grids may go beyond the horizon, but not by much.
+LARGEST_COSINE = 10.0
 LARGEST_NODES = 20_000_000
 
 
@@ -49,7 +53,7 @@ def format_cuts(cuts: Sequence[Cut], polarization: str = "x", text: str = "Field
 def parse_cuts(text: str, source: str = "the cuts", polarization: str = "x") -> tuple[Cut, ...]:
     """The cuts of the text of a .cut file, in its order, with co and cross of this polarisation.
 
-    Raises InputError, naming the line, when it holds anything but polar cuts of two complex components (ICUT 1, ICOMP 1 to 3).
+    Raises InputError, naming the line, when it holds anything but polar cuts of a far field (ICUT 1, ICOMP 1 to 3).
     """
     lines = Lines(text, source)
     cuts = []
@@ -61,9 +65,8 @@ def parse_cuts(text: str, source: str = "the cuts", polarization: str = "x") -> 
         _check_components(lines, icomp, ncomp)
         if count != round(count) or count < 1 or (step == 0 and count > 1):
             raise lines.error(f"a cut needs one or more angles in steps other than zero, not V_NUM {count:g} and V_INC {step:g}")
-        values = lines.block(4 * int(count), f"{int(count)} field values of two components").reshape(-1, 4)
-        parts = values[:, 0] + 1j * values[:, 1], values[:, 2] + 1j * values[:, 3]
-        co, cross = _from_file(int(icomp), *parts, np.radians(phi), polarization)
+        parts = _components(lines, int(count), int(ncomp))
+        co, cross = _from_file(int(icomp), parts[0], parts[1], np.radians(phi), polarization)
         cuts.append(Cut(first + step * np.arange(int(count)), float(phi), co, cross))
     if not cuts:
         raise InputError(f"{source} holds no cut")
@@ -129,7 +132,7 @@ def format_grd(grids: Sequence[PatternGrid], frequencies_ghz: Sequence[float], p
 def parse_grd(text: str, source: str = "the grid", polarization: str = "x") -> tuple[PatternGrid, ...]:
     """The fields of the text of a .grd file, one for each set in it, with co and cross of this polarisation.
 
-    Raises InputError, naming the line, when it holds anything but grids over u and v (KTYPE 1, IGRID 1) of two components (ICOMP 1 to 3).
+    Raises InputError, naming the line, when it holds anything but grids over u and v (KTYPE 1, IGRID 1) of a far field (ICOMP 1 to 3).
     """
     lines = Lines(text, source)
     while not lines.line("a line ++++").startswith("++++"):
@@ -143,7 +146,7 @@ def parse_grd(text: str, source: str = "the grid", polarization: str = "x") -> t
         raise lines.error(f"IGRID is {igrid}, and only 1 (a grid over u and v) is read")
     lines.fits(count, "NSET")
     centers = [lines.integers("IX IY") for _ in range(count)]
-    grids = tuple(_read_set(lines, ix, iy, icomp, polarization) for ix, iy in centers)
+    grids = tuple(_read_set(lines, ix, iy, (icomp, ncomp), polarization) for ix, iy in centers)
     lines.finish()
     return grids
 
@@ -174,24 +177,26 @@ def _grid_lines(grid: PatternGrid, polarization: str) -> list[str]:
     return lines
 
 
-def _read_set(lines: Lines, ix: int, iy: int, icomp: int, polarization: str) -> PatternGrid:
+def _read_set(lines: Lines, ix: int, iy: int, components: tuple[int, int], polarization: str) -> PatternGrid:
+    icomp, ncomp = components
     xs, ys, xe, ye = lines.numbers("XS YS XE YE")
     nx, ny, klimit = lines.integers("NX NY KLIMIT")
     if nx < 2 or ny < 2 or not (xe > xs and ye > ys) or klimit not in (0, 1):
         raise lines.error(f"a grid needs two or more nodes along rising u and v and KLIMIT 0 or 1, not {nx}, {ny} and {klimit}")
-    # rows that are left out take two characters each, others more
-    lines.fits(4 * nx * ny if klimit == 0 else 2 * ny, f"a grid of {nx} x {ny} nodes")
+    # a row that is left out still has its line of two numbers
+    lines.fits(2 * ncomp * nx * ny if klimit == 0 else 2 * ny, f"a grid of {nx} x {ny} nodes")
     if nx * ny > LARGEST_NODES:
         raise lines.error(f"a grid of {nx} x {ny} nodes is larger than {LARGEST_NODES} nodes")
     step = (xe - xs) / (nx - 1), (ye - ys) / (ny - 1)
     u, v = xs + step[0] * (ix + np.arange(nx)), ys + step[1] * (iy + np.arange(ny))
+    if max(np.abs(u).max(), np.abs(v).max()) > LARGEST_COSINE:
+        raise lines.error(f"u from {u[0]:g} to {u[-1]:g} and v from {v[0]:g} to {v[-1]:g} are no direction cosines")
     parts = np.full((2, ny, nx), np.nan + 0j)
     for row in range(ny):
         start, number = lines.integers("IS IN") if klimit else (1, nx)
         if number and not 1 <= start <= start + number - 1 <= nx:
             raise lines.error(f"columns {start} to {start + number - 1} do not lie within 1 to {nx}")
-        values = lines.block(4 * number, f"{number} field values of two components").reshape(-1, 4)
-        parts[:, row, start - 1 : start - 1 + number] = (values[:, 0::2] + 1j * values[:, 1::2]).T
+        parts[:, row, start - 1 : start - 1 + number] = _components(lines, number, ncomp)
     across, up = np.meshgrid(u, v)
     parts[:, across**2 + up**2 >= 1] = np.nan
     co, cross = _from_file(icomp, parts[0], parts[1], np.arctan2(up, across), polarization)
@@ -225,9 +230,18 @@ def _steps(values: Array, name: str) -> tuple[float, float]:
     return float(values[0]), float((values[-1] - values[0]) / (len(values) - 1))
 
 
+def _components(lines: Lines, number: int, ncomp: int) -> Complex:
+    """The two components (2, N) across the ray of so many field values; a third, along it, must be next to nothing."""
+    values = lines.block(2 * ncomp * number, f"{number} field values of {ncomp} components").reshape(number, 2 * ncomp)
+    parts = (values[:, 0::2] + 1j * values[:, 1::2]).T
+    if np.abs(parts[2:]).max(initial=0.0) > RADIAL * np.abs(parts[:2]).max(initial=0.0):
+        raise lines.error("the third component, along the ray, is not small: this is a near field, and a far field is needed")
+    return np.asarray(parts[:2])
+
+
 def _check_components(lines: Lines, icomp: float, ncomp: float) -> None:
-    if ncomp != 2:
-        raise lines.error(f"NCOMP is {ncomp:g}, and only far fields of 2 components are read (3: a near field)")
+    if ncomp not in (2, 3):
+        raise lines.error(f"NCOMP is {ncomp:g}, and fields of 2 components (or 3, for near fields) are read")
     if icomp not in (THETA_PHI, CIRCULAR, LUDWIG):
         raise lines.error(f"ICOMP is {icomp:g}; 1 (theta, phi), 2 (right, left circular) and 3 (Ludwig 3) are read: export one of these")
 
