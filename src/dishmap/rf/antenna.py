@@ -204,6 +204,13 @@ class Antenna:
                 f"the subreflector's vertex would lie at z = {sub_vertex_z_mm(main, sub):.4g} mm, behind the vertex of the dish; "
                 "a smaller foci_distance_mm moves it towards the focus"
             )
+        # the asymptote of the hyperboloid, seen from F1: tan(psi / 2) = sqrt(M), and the rim is seen at tan(psi / 2) = x / (2 f)
+        steep = (abs(main.offset_mm) + main.diameter_mm / 2) / (2 * main.focal_length_mm)
+        if sub is not None and sub.kind == "cassegrain" and steep**2 >= sub.magnification:
+            raise InputError(
+                f"no hyperboloid of magnification {sub.magnification:g} reflects rays to the rim of so deep a dish; "
+                f"give a magnification over {steep**2:.3g} or a longer focal length"
+            )
 
 
 def sub_vertex_z_mm(reflector: Reflector, subreflector: Subreflector) -> float:

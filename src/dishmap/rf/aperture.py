@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dishmap.rf.antenna import Antenna
+from dishmap.rf.antenna import Antenna, Blockage
 
 Array = NDArray[np.float64]
 
@@ -31,18 +31,21 @@ class ApertureNodes:
     lit: int
 
 
-def aperture_nodes(antenna: Antenna, rings: int, spokes: int, shadow_radius_mm: float) -> ApertureNodes:
-    """Nodes over the aperture of an antenna, less the shadows of a disc of this radius about the axis and of the struts."""
+def aperture_nodes(antenna: Antenna, rings: int, spokes: int, shadow_radius_mm: float, shadow_x_mm: float = 0.0) -> ApertureNodes:
+    """Nodes over the aperture of an antenna, less the shadows of a disc of this radius about (shadow_x_mm, 0) and of the struts."""
     main, blockage = antenna.reflector, antenna.blockage
     center, radius = main.center_mm, main.diameter_mm / 2
+    shadow = np.array([shadow_x_mm, 0.0])
     parts = [_disc(center, radius, rings, spokes)]
     lit = rings * spokes
     if shadow_radius_mm > 0:
-        xy, weight = _shadow(center, radius, shadow_radius_mm, rings, spokes)
+        xy, weight = _shadow(center, radius, shadow, shadow_radius_mm, rings, spokes)
         parts.append((xy, -weight))
     for k in range(blockage.struts):
         angle = np.radians(blockage.strut_angle_deg) + 2 * np.pi * k / blockage.struts
-        xy, weight = _strut(center, radius, angle, blockage.strut_width_mm, _strut_start(antenna, shadow_radius_mm), rings)
+        foot, way, thick = _strips(angle, blockage.strut_width_mm)
+        begin = np.maximum(_apart(foot, blockage), _chord(shadow, shadow_radius_mm, foot, way)[1])
+        xy, weight = _strut(center, radius, foot, way, thick, begin, rings)
         parts.append((xy, -weight))
     return ApertureNodes(np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]), lit)
 
@@ -55,33 +58,39 @@ def _disc(center: Array, radius: float, rings: int, spokes: int) -> tuple[Array,
     return xy.reshape(-1, 2), weight
 
 
-def _shadow(center: Array, radius: float, shadow: float, rings: int, spokes: int) -> tuple[Array, Array]:
-    """The part of a disc about the axis that lies in the aperture, along its own spokes."""
+def _shadow(center: Array, radius: float, shadow: Array, shadow_radius: float, rings: int, spokes: int) -> tuple[Array, Array]:
+    """The part of a disc about `shadow` that lies in the aperture, along its own spokes."""
     phi = 2 * np.pi * (np.arange(spokes) + 0.5) / spokes
     way = np.stack([np.cos(phi), np.sin(phi)], axis=-1)
-    begin, end = _chord(center, radius, np.zeros((spokes, 2)), way)
-    begin, end = np.maximum(begin, 0.0), np.minimum(end, shadow)
+    begin, end = _chord(center, radius, np.tile(shadow, (spokes, 1)), way)
+    begin, end = np.maximum(begin, 0.0), np.minimum(end, shadow_radius)
     rho, step = _rule(rings, begin, np.maximum(end, begin))
-    xy = rho[..., None] * way[:, None]
+    xy = shadow + rho[..., None] * way[:, None]
     return xy.reshape(-1, 2), (rho * step).ravel() * (2 * np.pi / spokes)
 
 
-def _strut(center: Array, radius: float, angle: float, width: float, start: float, rings: int) -> tuple[Array, Array]:
-    """A strip from `start` off the axis to the rim."""
+def _strips(angle: float, width: float) -> tuple[Array, Array, Array]:
+    """Lines along a strut, from beside the axis: feet (A, 2), unit ways (A, 2), and how thick a strip each stands for (A,)."""
     along, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
     side, thick = _rule(ACROSS_STRUT, np.array([-width / 2]), np.array([width / 2]))
-    foot = side[0][:, None] * across
-    begin, end = _chord(center, radius, foot, np.tile(along, (len(foot), 1)))
-    begin = np.maximum(begin, np.sqrt(np.maximum(start**2 - side[0] ** 2, 0.0)))
+    return side[0][:, None] * across, np.tile(along, (ACROSS_STRUT, 1)), thick[0]
+
+
+def _strut(center: Array, radius: float, foot: Array, way: Array, thick: Array, start: Array, rings: int) -> tuple[Array, Array]:
+    """The strips of a strut from `start` (A,) to the rim."""
+    begin, end = _chord(center, radius, foot, way)
+    begin = np.maximum(begin, start)
     rho, step = _rule(2 * rings, begin, np.maximum(end, begin))
-    xy = foot[:, None] + rho[..., None] * along
-    return xy.reshape(-1, 2), (step * thick[0][:, None]).ravel()
+    xy = foot[:, None] + rho[..., None] * way[:, None]
+    return xy.reshape(-1, 2), (step * thick[:, None]).ravel()
 
 
-def _strut_start(antenna: Antenna, shadow: float) -> float:
-    """Where struts begin: at the blocked disc, or where they no longer overlap."""
-    count, width = antenna.blockage.struts, antenna.blockage.strut_width_mm
-    return max(shadow, width / (2 * np.sin(np.pi / count)) if count > 1 else 0.0)
+def _apart(foot: Array, blockage: Blockage) -> Array:
+    """How far along (A,) from the axis struts no longer overlap their neighbours."""
+    if blockage.struts < 3:
+        return np.zeros(len(foot))
+    reach = blockage.strut_width_mm / (2 * np.sin(np.pi / blockage.struts))
+    return np.asarray(np.sqrt(np.maximum(reach**2 - (foot**2).sum(axis=1), 0.0)))
 
 
 def _chord(center: Array, radius: float, foot: Array, way: Array) -> tuple[Array, Array]:

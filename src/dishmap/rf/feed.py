@@ -7,6 +7,7 @@ co-polar only (Ludwig 1973): the vector at the axis, carried along the great cir
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,8 +52,7 @@ def feed_field(feed: Feed, edge_rad: float, reflections: int) -> FeedField:
             "use a gaussian feed or a longer focal length"
         )
     one = FeedField(feed, edge_rad, hand, 1.0)
-    power = 2 * np.pi * quad(lambda t: _profile(one, np.array([np.cos(t)]))[0] ** 2 * np.sin(t), 0, np.pi, limit=200)[0]
-    return FeedField(feed, edge_rad, hand, float(power**-0.5))
+    return FeedField(feed, edge_rad, hand, float((2 * np.pi * _power(one)) ** -0.5))
 
 
 def radiated(field: FeedField, direction: Array) -> Complex:
@@ -99,6 +99,14 @@ def _profile(field: FeedField, cosine: Array) -> Array:
     # over the aperture the field is the feed's times cos^2 of half the angle, over the equivalent focal length
     half2 = np.maximum((1 + cosine) / 2, 1e-12)
     return np.asarray(10 ** (-feed_taper(feed) / 20 * ((1 / half2 - 1) / np.tan(edge / 2) ** 2)) / half2)
+
+
+def _power(field: FeedField) -> float:
+    """Integral of the squared profile over the cosine, in pieces that double from half the rim's angle: the beam may be very narrow."""
+    ends = [0.0, *(field.edge_rad / 2 * 2.0 ** np.arange(60))]
+    ends = [*(t for t in ends if t < np.pi), np.pi]
+    pieces = (quad(lambda t: _profile(field, np.array([np.cos(t)]))[0] ** 2 * np.sin(t), a, b)[0] for a, b in pairwise(ends))
+    return float(sum(pieces))
 
 
 def feed_taper(feed: Feed) -> float:

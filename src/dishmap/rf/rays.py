@@ -33,7 +33,8 @@ class Rays:
 
     path_mm (N,): from the feed's phase centre; direction (N, 3): of arrival; field (N, 3): electric field there without the phase of the
     path, for a feed that radiates unit power; by_values (N, 5 + T): derivative of the path to the values of the correction (mm per mm
-    or degree); lost (N,): no ray arrives. reflection_mm (N, 3): where the subreflector was met, NaN at the prime focus.
+    or degree); lost (N,): no ray arrives, or several do, crossing off a bent subreflector. reflection_mm (N, 3): where the
+    subreflector was met, NaN at the prime focus.
     """
 
     path_mm: Array
@@ -100,16 +101,16 @@ def _reflected(antenna: Antenna, surface: SubSurface, feed: FeedPlace, points: A
     assert antenna.subreflector is not None
     xy = local_xy(surface, nominal_reflection(antenna.reflector, antenna.subreflector, points))
     xy, found, here = _stationary(surface, feed.center_mm, points, xy)
-    lost = ~found | beyond_rim(surface, xy)
-    _check_clear(antenna, feed, here)
-    up, down = here.point_mm - feed.center_mm, points - here.point_mm
-    d1, d2 = np.linalg.norm(up, axis=1), np.linalg.norm(down, axis=1)
-    a, b = up / d1[:, None], down / d2[:, None]
+    a, b, d1, d2 = _ways(here.point_mm, feed.center_mm, points)
+    hessian = _hessian(here, a, b, d1, d2)
+    # off the nominal subreflector a path is shortest or longest; one that is neither has passed a caustic, and is one of several
+    lost = ~found | beyond_rim(surface, xy) | (np.linalg.det(hessian) <= 0)
+    _check_clear(antenna, feed, here.point_mm[~lost])
     normal = np.cross(here.first[:, :, 0], here.first[:, :, 1])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     sent = radiated(feed.field, a @ feed.rotation) @ feed.rotation.T
     field = 2 * (normal * sent).sum(axis=1, keepdims=True) * normal - sent
-    field = field * np.sqrt(_concentration(here, a, b, d1, d2))[:, None]
+    field = field * np.sqrt(_concentration(here, hessian, a, b, d1, d2))[:, None]
     field[lost] = 0.0
     return Rays(d1 + d2, b, field, _by_values(surface, here, xy, a - b, correction), lost, here.point_mm)
 
@@ -145,7 +146,7 @@ def _hessian(here: Patch, a: Array, b: Array, d1: Array, d2: Array) -> Array:
     return np.asarray(bent + flat)
 
 
-def _concentration(here: Patch, a: Array, b: Array, d1: Array, d2: Array) -> Array:
+def _concentration(here: Patch, hessian: Array, a: Array, b: Array, d1: Array, d2: Array) -> Array:
     """Solid angle (N,) at the feed for each area across the arriving ray: how much power arrives there, in 1/mm^2.
 
     A step e across the ray at the dish moves the point of reflection by H^-1 Q' e / d2, by the implicit function theorem.
@@ -154,7 +155,7 @@ def _concentration(here: Patch, a: Array, b: Array, d1: Array, d2: Array) -> Arr
     e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
     across = np.stack([e1, np.cross(b, e1)], axis=2)
     right = np.swapaxes(here.first, 1, 2) @ across / d2[:, None, None]
-    moved = here.first @ _solve(_hessian(here, a, b, d1, d2), right)
+    moved = here.first @ _solve(hessian, right)
     turned = (moved - a[:, :, None] * np.einsum("ni,nij->nj", a, moved)[:, None]) / d1[:, None, None]
     return np.abs((a * np.cross(turned[:, :, 0], turned[:, :, 1])).sum(axis=1))
 
@@ -172,9 +173,9 @@ def _by_values(surface: SubSurface, here: Patch, xy: Array, gap: Array, correcti
     return out
 
 
-def _check_clear(antenna: Antenna, feed: FeedPlace, here: Patch) -> None:
-    """Raise InputError when the subreflector touches the dish or lies behind the feed."""
-    x, y, z = here.point_mm.T
+def _check_clear(antenna: Antenna, feed: FeedPlace, points: Array) -> None:
+    """Raise InputError when the subreflector, where rays meet it (N, 3), touches the dish or lies behind the feed."""
+    x, y, z = points.T
     gap = z - (x**2 + y**2) / (4 * antenna.reflector.focal_length_mm)
     if (gap <= 0).any():
         raise InputError(

@@ -25,8 +25,8 @@ Complex = NDArray[np.complex128]
 LIGHT_MM_GHZ = 299.792458
 # Under so many wavelengths across, currents by physical optics are no longer those of the dish.
 LEAST_WAVELENGTHS = 3.0
-# Rings and spokes of the quadrature: for the illumination, for each radian of phase at the rim towards the widest direction wanted, and
-# for each degree of the deformation.
+# Rings and spokes of the quadrature: for the illumination, for each radian of phase at the rim (towards the widest direction wanted, plus
+# what the steepest part of the deformation adds), and for each degree of the deformation.
 RINGS, SPOKES = (24, 0.6, 1), (64, 1.3, 3)
 # Half the angular width of the beam is about this over the diameter in wavelengths.
 BEAM = 0.6
@@ -66,20 +66,38 @@ def wavelength_of(antenna: Antenna, frequency_ghz: float) -> float:
 def sampled(antenna: Antenna, deformation: Deformation, wavelength_mm: float, widest: float = 0.0) -> ApertureNodes:
     """Nodes fine enough for directions up to `widest` (sine of the angle from the boresight), at least for the main beam."""
     widest = max(widest, 3 * BEAM * wavelength_mm / antenna.reflector.diameter_mm)
-    phase = np.pi * antenna.reflector.diameter_mm / wavelength_mm * widest
-    degree = max((n for n, _ in deformation.terms), default=0)
-    rings, spokes = (int(np.ceil(base + slope * phase + bent * degree)) for base, slope, bent in (RINGS, SPOKES))
-    return aperture_nodes(antenna, rings, spokes, shadow_radius_mm(antenna))
+    wavenumber, degree = 2 * np.pi / wavelength_mm, max((n for n, _ in deformation.terms), default=0)
+    phase = wavenumber * antenna.reflector.diameter_mm / 2 * widest
+    steep = 2 * wavenumber * _steepest(antenna, deformation)
+    counts = [base + slope * (phase + extra) + bent * degree for (base, slope, bent), extra in zip((RINGS, SPOKES), steep, strict=True)]
+    rings, spokes = (int(np.ceil(count)) for count in counts)
+    return aperture_nodes(antenna, rings, spokes, *shadow_mm(antenna))
 
 
-def shadow_radius_mm(antenna: Antenna) -> float:
-    """Radius of the disc about the axis that is blocked: as given, or the subreflector's own where it is on the axis."""
+def shadow_mm(antenna: Antenna) -> tuple[float, float]:
+    """The disc that is blocked: its radius and where its middle lies on x; as given (about the axis), or the subreflector's own."""
     if antenna.blockage.diameter_mm is not None:
-        return antenna.blockage.diameter_mm / 2
+        return antenna.blockage.diameter_mm / 2, 0.0
     if antenna.subreflector is None:
-        return 0.0
+        return 0.0, 0.0
     center, radius = rim_disc(antenna.reflector, antenna.subreflector)
-    return radius if abs(center) < radius else 0.0
+    return radius, center
+
+
+def _steepest(antenna: Antenna, deformation: Deformation) -> Array:
+    """Steepest slopes (2,) of the deformation in mm: for each aperture radius outwards, and for each radian around.
+
+    The slope outwards counts less towards the middle and the rim, where a Gauss rule is denser: 2 sqrt(rho (1 - rho)).
+    """
+    degree = max((n for n, _ in deformation.terms), default=0)
+    rings, spokes = degree + 4, 4 * degree + 8
+    away = aperture_nodes(antenna, rings, spokes, 0.0).xy_mm - antenna.reflector.center_mm
+    gradient = displacement(deformation, away + antenna.reflector.center_mm)[1]
+    radius = antenna.reflector.diameter_mm / 2
+    rho = np.linalg.norm(away, axis=1) / radius
+    outwards = np.abs((gradient * away).sum(axis=1)) / rho * 2 * np.sqrt(rho * (1 - rho))
+    around = np.abs(gradient[:, 1] * away[:, 0] - gradient[:, 0] * away[:, 1])
+    return np.array([outwards.max(), around.max()])
 
 
 def sources(antenna: Antenna, deformation: Deformation, correction: Correction, nodes: ApertureNodes) -> Sources:
