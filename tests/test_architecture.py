@@ -90,6 +90,7 @@ ORDER = [
     *("io.scenario_pattern", "io.scenario_file", "io.truth_file", "io.points_file", "io.measurement_file", "io.results"),
     *("io.difference_file", "io.difference_map_file", "io.difference_results", "io.board_file", "io.sheet_file"),
     *("io.grasp_text", "io.grasp_surface", "io.grasp_pattern", "io.antenna_file", "io.rf_netcdf", "io.cuts_csv"),
+    "io.shape_input",
     # people: what a map says in words, in pictures, on a page
     *(
         "verdict",

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from dishmap.io.images import read_gray, read_turn_deg
     from dishmap.io.measurement_file import read_measurement, write_measurement
     from dishmap.io.pattern_file import read_pattern, write_pattern
+    from dishmap.io.shape_input import read_shape_field
     from dishmap.io.sheet_file import write_sheets
     from dishmap.pipeline import map_photograph
     from dishmap.planning import Conditions, camera_of_lens, plan
@@ -105,6 +106,7 @@ _HOME = {
     "read_gray": "dishmap.io.images",
     "read_measurement": "dishmap.io.measurement_file",
     "read_pattern": "dishmap.io.pattern_file",
+    "read_shape_field": "dishmap.io.shape_input",
     "read_turn_deg": "dishmap.io.images",
     "simulate_photograph": "dishmap.simulate.render",
     "undistort_image": "dishmap.camera.undistort",
@@ -166,6 +168,7 @@ __all__ = [
     "read_gray",
     "read_measurement",
     "read_pattern",
+    "read_shape_field",
     "read_turn_deg",
     "simulate_photograph",
     "track_targets",

@@ -31,6 +31,8 @@ DIFFERENCE_FILE = "difference.npz"
 FORMAT = "dishmap-difference-map/1"
 HEADER = "header"
 AGAIN = "make it again with `dishmap diff`"
+# Within which the header's first key stands.
+BEGINNING_BYTES = 1024
 # 10,000 targets with 300 columns take 50 MB.
 LARGEST_FILE_BYTES = 200_000_000
 # What an archive may unpack to, relative to its size: arrays are stored as they are, so there is only the header of the archive.
@@ -72,6 +74,16 @@ def difference_bytes(saved: SavedDifference) -> bytes:
 def write_difference_map(path: str | Path, saved: SavedDifference) -> None:
     """Write a difference file, whole or not at all. Raises InputError when it cannot be written."""
     write_bytes(path, difference_bytes(saved))
+
+
+def is_difference_map(path: str | Path) -> bool:
+    """Whether a file begins as a difference file does; False when it cannot be read."""
+    try:
+        with Path(path).open("rb") as stream:
+            # the header comes first, and nothing in the archive is compressed
+            return FORMAT.partition("/")[0].encode() in stream.read(BEGINNING_BYTES)
+    except (OSError, ValueError):
+        return False
 
 
 def read_difference_map(path: str | Path) -> SavedDifference:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dishmap.compare import DifferenceTable
+from dishmap.difference.changes import rigid_columns
 from dishmap.difference.saved import SavedDifference
 from dishmap.errors import InputError
 from dishmap.rf.antenna import Reflector
@@ -63,8 +64,9 @@ def shape_field_of_table(table: DifferenceTable, reflector: Reflector, quantity:
 def shape_field_of_points(cloud: PointCloud, reflector: Reflector, camera_covariance: ArrayLike | None = None) -> ShapeField:
     """The deviation of the reflector from its nominal paraboloid, from measured points in the dish frame.
 
-    Values are exact distances from the paraboloid, at the points' feet on it. The rigid pose of the dish counts as known. camera_covariance
-    (P, P): of the calibration, whose error all points share. Raises InputError for another frame or points far from the reflector.
+    Values are exact distances from the paraboloid, at the points' feet on it. camera_covariance (P, P): of the calibration, whose error all
+    points share; the dish frame was fitted to the same points, so what of that error is a rigid motion is not in the values. Raises
+    InputError for another frame or points far from the reflector.
     """
     if cloud.frame != "dish":
         raise InputError(f"the points of a shape must be in the dish frame, not in the {cloud.frame} frame; use transform_cloud")
@@ -78,6 +80,8 @@ def shape_field_of_points(cloud: PointCloud, reflector: Reflector, camera_covari
         )
     foot = cloud.position_mm - distance[:, None] * normal
     shared = np.zeros((len(cloud), 3, 0)) if camera_covariance is None else calibration_factor_mm(cloud, camera_covariance)
+    rigid = rigid_columns(cloud.position_mm)
+    shared = shared - rigid @ (np.linalg.pinv(rigid.reshape(-1, 6)) @ shared.reshape(3 * len(cloud), -1))
     targets = TargetValues(
         ids=cloud.ids,
         places_mm=foot[:, :2],
