@@ -48,17 +48,17 @@ def shape_field_of_difference(saved: SavedDifference, reflector: Reflector, quan
 def shape_field_of_table(table: DifferenceTable, reflector: Reflector, quantity: str = "shape") -> ShapeField:
     """The change of the reflector from the rows of `difference.csv`.
 
-    The table has no covariance: its errors are taken as independent, so that sigmas of broad terms come out too small, which those of
-    `shape_field_of_difference` do not. Where the table has no sigmas, the scatter of the values alone says how uncertain they are. Raises
-    what `shape_field_of_difference` raises.
+    The table has no covariance: its errors are taken as independent, so that sigmas of broad terms come out too small where they are not,
+    as in most differences; `difference.npz` has the covariance. Where the table has no sigmas (the paper's method), the scatter of its
+    values about a smooth surface alone says how uncertain they are. Raises what `shape_field_of_difference` raises.
     """
     _check_quantity(quantity)
     _check_heights(table, reflector)
     sigma = table.sigma_shape_mm if quantity == "shape" else table.sigma_displacement_mm
     value = table.shape_mm if quantity == "shape" else table.displacement_mm
-    none = np.zeros((len(table), 0))
+    none, known = np.zeros((len(table), 0)), bool(np.isfinite(sigma).all())
     own = np.nan_to_num(sigma, nan=0.0) ** 2
-    return shape_field(TargetValues(table.ids, table.nominal_mm[:, :2], value, none, own, table.quality, settled=False), reflector)
+    return shape_field(TargetValues(table.ids, table.nominal_mm[:, :2], value, none, own, table.quality, settled=known), reflector)
 
 
 def shape_field_of_points(cloud: PointCloud, reflector: Reflector, camera_covariance: ArrayLike | None = None) -> ShapeField:
