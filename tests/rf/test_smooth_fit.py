@@ -40,9 +40,10 @@ def after(prior: np.ndarray, gain: np.ndarray, noise: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(("amplitude", "own"), SIZES)
 def test_measured_values_give_what_regression_gives(amplitude: float, own: float) -> None:
     one, prior = values(settled=False), plain_prior(amplitude)
-    mean, covariance = _View(one, AT, PLACES, ROOT).field(amplitude, own**2)
+    mean, covariance, response = _View(one, AT, PLACES, ROOT).field(amplitude, own**2)
     noise = one.factor_mm @ one.factor_mm.T + np.diag(one.own_mm2 + own**2)
     gain = prior @ AT.T @ np.linalg.inv(AT @ prior @ AT.T + noise)
+    assert np.abs(response - gain).max() < CLOSE
     assert np.abs(mean - gain @ one.mean_mm).max() < CLOSE
     assert np.abs(covariance - after(prior, gain, noise)).max() < CLOSE
 
@@ -50,9 +51,10 @@ def test_measured_values_give_what_regression_gives(amplitude: float, own: float
 @pytest.mark.parametrize(("amplitude", "own"), SIZES)
 def test_settled_values_are_extended(amplitude: float, own: float) -> None:
     one, prior = values(settled=True), plain_prior(amplitude)
-    mean, covariance = _View(one, AT, PLACES, ROOT).field(amplitude, own**2)
+    mean, covariance, response = _View(one, AT, PLACES, ROOT).field(amplitude, own**2)
     gain = prior @ AT.T @ np.linalg.inv(AT @ prior @ AT.T + own**2 * np.eye(40))
     doubt = one.factor_mm @ one.factor_mm.T + np.diag(one.own_mm2)
+    assert np.abs(response - gain).max() < CLOSE
     assert np.abs(mean - gain @ one.mean_mm).max() < CLOSE
     assert np.abs(covariance - after(prior, gain, own**2 * np.eye(40) + doubt)).max() < CLOSE
 

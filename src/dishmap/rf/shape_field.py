@@ -44,8 +44,8 @@ class ShapeField:
 
     terms: (n, m) of T unnormalised Zernike terms on the aperture's disc with center_mm (2,) and radius_mm, in nominal x and y; mean_mm (T,)
     and factor_mm (T, R) of their coefficients, whose covariance is factor factor^T. places_mm (N, 2): the targets it rests on; spacing_mm:
-    typical distance between them; own_mm: rms of what targets do on their own, beyond the field; left_out: ids of targets that moved apart
-    from the surface.
+    typical distance between them; response (T, N): of the coefficients to the displacements of those targets, all that was learnt counted as
+    known; own_mm: rms of what targets do on their own, beyond the field; left_out: ids of targets that moved apart from the surface.
     """
 
     terms: Terms
@@ -55,6 +55,7 @@ class ShapeField:
     radius_mm: float
     places_mm: Array
     spacing_mm: float
+    response: Array
     own_mm: float
     left_out: tuple[int, ...]
 
@@ -122,7 +123,7 @@ def shape_field(targets: TargetValues, reflector: Reflector) -> ShapeField:
         inner = narrowed(terms, radius / wide) if wide > radius else np.eye(len(terms))
         factor = _factor(inner @ fit.covariance_mm2 @ inner.T)
     left_out = tuple(int(i) for i in targets.ids[~keep])
-    return ShapeField(terms, inner @ fit.mean_mm, factor, center, radius, places, spacing, fit.own_mm, left_out)
+    return ShapeField(terms, inner @ fit.mean_mm, factor, center, radius, places, spacing, inner @ fit.response, fit.own_mm, left_out)
 
 
 def _check_inside(targets: TargetValues, reflector: Reflector) -> None:

@@ -58,11 +58,15 @@ class Values:
 
 @dataclass(frozen=True)
 class SmoothFit:
-    """Coefficients (T,) of the field in mm and their covariance (T, T); own_mm: rms of what targets do on their own."""
+    """Coefficients (T,) of the field in mm and their covariance (T, T), with all that was learnt counted as known.
+
+    own_mm: rms of what targets do on their own; response (T, N): of the coefficients to the values.
+    """
 
     mean_mm: Array
     covariance_mm2: Array
     own_mm: float
+    response: Array
 
 
 def fit_smooth(values: Values, terms: Terms, finest: float) -> SmoothFit:
@@ -82,9 +86,10 @@ def fit_smooth(values: Values, terms: Terms, finest: float) -> SmoothFit:
     weight = np.where(evidence > evidence.max() - LEAST_LOG_WEIGHT, np.exp(evidence - evidence.max()), 0.0)
     weight /= weight.sum()
     parts = [(w, *view.field(a, v), v) for w, view, (_, a, v) in zip(weight, views, fits, strict=True) if w > 0]
-    mean = np.sum([w * m for w, m, _, _ in parts], axis=0)
-    covariance = np.sum([w * (c + np.outer(m - mean, m - mean)) for w, m, c, _ in parts], axis=0)
-    return SmoothFit(mean, covariance, float(np.sqrt(sum(w * v for w, _, _, v in parts))))
+    mean = np.sum([w * m for w, m, _, _, _ in parts], axis=0)
+    covariance = np.sum([w * (c + np.outer(m - mean, m - mean)) for w, m, c, _, _ in parts], axis=0)
+    response = np.sum([w * r for w, _, _, r, _ in parts], axis=0)
+    return SmoothFit(mean, covariance, float(np.sqrt(sum(w * v for w, _, _, _, v in parts))), response)
 
 
 def _broad(xy: Array, terms: Terms) -> list[int]:
@@ -185,19 +190,19 @@ class _View:
         root = cholesky(design.T @ (design * weight[:, None]) + np.diag(prior), lower=True)
         return design, weight, root, cho_solve((root, True), design.T @ (weight * self.values.mean_mm))
 
-    def field(self, amplitude: float, own: float) -> tuple[Array, Array]:
-        """Mean (T,) and covariance (T, T) of the coefficients for given sizes."""
+    def field(self, amplitude: float, own: float) -> tuple[Array, Array, Array]:
+        """Mean (T,) and covariance (T, T) of the coefficients for given sizes, and the response (T, N) of the mean to the values."""
         count = self.spread.shape[1]
         if self.values.settled:
             # of the field for given values, then over what the values may be
             share = (amplitude * self.s) ** 2 / ((amplitude * self.s) ** 2 + own)
             gain = np.concatenate([self.q, self.u * (share / self.s)], axis=1).T
-            mean = gain @ self.values.mean_mm
             inner = np.diag(np.concatenate([np.full(self.q.shape[1], own), own * share / self.s**2]))
             shared = gain @ self.values.factor_mm
             inner += shared @ shared.T + (gain * self.values.own_mm2) @ gain.T
         else:
-            _, _, root, mean = self._posterior(amplitude, own)
-            mean, inner = mean[:count], cho_solve((root, True), np.eye(len(root)))[:count, :count]
-        unseen = amplitude * self.unseen
-        return self.spread @ mean, self.spread @ inner @ self.spread.T + unseen @ unseen.T
+            design, weight, root, _ = self._posterior(amplitude, own)
+            whole = cho_solve((root, True), np.eye(len(root)))[:count]
+            inner, gain = whole[:, :count], whole @ (design * weight[:, None]).T
+        unseen, response = amplitude * self.unseen, self.spread @ gain
+        return response @ self.values.mean_mm, self.spread @ inner @ self.spread.T + unseen @ unseen.T, response

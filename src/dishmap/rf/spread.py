@@ -67,7 +67,9 @@ def spread(
     co_axis = polarization_axes(polarization, 1, *ludwig_axes(middle[None]))[0][0]
     wave = (sources.moment @ co_axis.conj()) * np.exp(1j * k * (sources.point_mm @ middle - sources.rays.path_mm))
     x, y = ((sources.nodes.xy_mm - deformation.center_mm) / deformation.radius_mm).T
-    rise = zernike_matrix(deformation.terms, x, y) @ (drawn_mm - deformation.coefficients_mm).T
+    # the mean surface goes along as the last one, to show what a sum with one polarisation for all directions leaves out of its figures
+    moved = np.concatenate([drawn_mm - deformation.coefficients_mm, np.zeros((1, len(deformation.terms)))])
+    rise = zernike_matrix(deformation.terms, x, y) @ moved.T
     change = (sources.normal * (sources.rays.direction - middle)).sum(axis=1)[:, None] * rise
     waves = wave[:, None] * np.exp(-1j * k * change)
     peaks = np.array([_peak(waves[:, d], sources.point_mm, k, beam) for d in range(waves.shape[1])])
@@ -78,7 +80,10 @@ def spread(
     rms = _weighted_rms(sources, beam, change, peaks)
     ruze = np.array([ruze_loss_db(value, wavelength_mm) for value in rms])
     gain = beam.gain_dbi + decibels(peaks[:, 2] / reference)
-    return Spread(np.column_stack([gain, bore, peaks[:, :2], cuts, rms, ruze]))
+    figures = np.column_stack([gain, bore, peaks[:, :2], cuts, rms, ruze])
+    known = [beam.gain_dbi, beam.boresight_dbi, beam.u, beam.v, *beam.width_deg, *beam.sidelobe_db]
+    figures[:, : len(known)] += np.nan_to_num(known - figures[-1, : len(known)])
+    return Spread(figures[:-1])
 
 
 def _direction(u: float, v: float) -> Array:
