@@ -75,9 +75,14 @@ def test_sigma_and_interval_are_those_of_the_draws() -> None:
     values[:, 0] = np.linspace(0.0, 1.0, 1001)
     values[::2, NAMES.index("sidelobe_0_db")] = np.nan
     values[:, NAMES.index("sidelobe_90_db")] = np.nan
-    one = Spread(values)
+    floor = np.zeros(len(NAMES))
+    floor[NAMES.index("boresight_dbi")] = 0.3
+    one = Spread(values, floor)
     assert one.interval("gain_dbi") == pytest.approx((0.025, 0.975), abs=1e-12)
     assert one.sigma("gain_dbi") == pytest.approx(np.sqrt(1 / 12), rel=1e-2)
+    # draws that agree are still no better than the computation
+    assert one.sigma("boresight_dbi") == pytest.approx(0.3)
+    assert one.interval("boresight_dbi") == pytest.approx((-0.3, 0.3))
     # a lobe that some draws do not have is described by the others, one that none has by nothing
     assert one.sigma("sidelobe_0_db") == 0.0
     assert np.isnan(one.sigma("sidelobe_90_db"))

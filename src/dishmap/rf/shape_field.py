@@ -36,6 +36,8 @@ LARGEST_LOOSE = 0.3
 # What of the covariance's trace is not worth a column.
 LEAST_COLUMN = 1e-12
 LEAST_TARGETS = 6
+# How well sizes are learnt: the standard deviation of their logarithm.
+SIZE_DOUBT = 0.5
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class ShapeField:
 
     terms: (n, m) of T unnormalised Zernike terms on the aperture's disc with center_mm (2,) and radius_mm, in nominal x and y; mean_mm (T,)
     and factor_mm (T, R) of their coefficients, whose covariance is factor factor^T. places_mm (N, 2): the targets it rests on; spacing_mm:
-    typical distance between them; response (T, N): of the coefficients to the displacements of those targets, all that was learnt counted as
+    typical distance between them; response (T, N): of the coefficients to displacements of those targets, all that was learnt taken as
     known; own_mm: rms of what targets do on their own, beyond the field; left_out: ids of targets that moved apart from the surface.
     """
 
@@ -67,8 +69,13 @@ def deformation_of(field: ShapeField, coefficients_mm: ArrayLike | None = None) 
 
 
 def draws(field: ShapeField, rng: Generator, count: int) -> Array:
-    """Coefficients (count, T) in mm of surfaces that may be the true one."""
-    return np.asarray(field.mean_mm + rng.standard_normal((count, field.factor_mm.shape[1])) @ field.factor_mm.T)
+    """Coefficients (count, T) in mm of surfaces that may be the true one, with the field's mean and covariance.
+
+    How rough a surface is was learnt from that one surface, so each draw has a size of its own: sums of squares over many terms, as a loss
+    of gain is, would otherwise seem known far too well.
+    """
+    size = np.exp(SIZE_DOUBT * rng.standard_normal((count, 1)) - SIZE_DOUBT**2)
+    return np.asarray(field.mean_mm + size * (rng.standard_normal((count, field.factor_mm.shape[1])) @ field.factor_mm.T))
 
 
 def sigma_at(field: ShapeField, xy_mm: ArrayLike) -> Array:

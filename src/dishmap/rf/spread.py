@@ -30,26 +30,34 @@ NAMES = (
 )
 
 
+# No figure is claimed better than this, whatever the map says: what physical optics, and paths to the first order with currents that do
+# not turn with the slopes, leave out. Gains and sidelobes in dB, direction cosines, widths relative to themselves, path errors none.
+FLOOR_DB, FLOOR_DIRECTION, FLOOR_WIDTH, FLOOR_SIDELOBE_DB = 1e-3, 1e-6, 2e-4, 0.02
+
+
 @dataclass(frozen=True)
 class Spread:
-    """Figures (K, len(NAMES)) of K drawn surfaces."""
+    """Figures (K, len(NAMES)) of K drawn surfaces, and the floor of each figure's sigma (len(NAMES),)."""
 
     draws: Array
+    floor: Array
 
     def of(self, name: str) -> Array:
         """All draws (K,) of one figure."""
         return np.asarray(self.draws[:, NAMES.index(name)])
 
     def sigma(self, name: str) -> float:
-        """Standard deviation of one figure, of the draws that have it."""
-        return float(np.nanstd(self.of(name))) if np.isfinite(self.of(name)).any() else float("nan")
+        """Standard deviation of one figure, of the draws that have it, NaN where none has."""
+        known = self.of(name)[np.isfinite(self.of(name))]
+        return float(np.hypot(known.std(), self.floor[NAMES.index(name)])) if len(known) else float("nan")
 
     def interval(self, name: str) -> tuple[float, float]:
-        """The middle 95 % of one figure."""
-        if not np.isfinite(self.of(name)).any():
+        """The middle 95 % of one figure, NaN where no draw has it."""
+        known, floor = self.of(name)[np.isfinite(self.of(name))], float(self.floor[NAMES.index(name)])
+        if not len(known):
             return float("nan"), float("nan")
-        low, high = np.nanpercentile(self.of(name), [2.5, 97.5])
-        return float(low), float(high)
+        low, high = np.percentile(known, [2.5, 97.5])
+        return float(low) - floor, float(high) + floor
 
 
 def spread(
@@ -83,7 +91,9 @@ def spread(
     figures = np.column_stack([gain, bore, peaks[:, :2], cuts, rms, ruze])
     known = [beam.gain_dbi, beam.boresight_dbi, beam.u, beam.v, *beam.width_deg, *beam.sidelobe_db]
     figures[:, : len(known)] += np.nan_to_num(known - figures[-1, : len(known)])
-    return Spread(figures[:-1])
+    widths = FLOOR_WIDTH * np.nan_to_num(beam.width_deg)
+    floor = [FLOOR_DB, FLOOR_DB, FLOOR_DIRECTION, FLOOR_DIRECTION, *widths, FLOOR_SIDELOBE_DB, FLOOR_SIDELOBE_DB, 0.0, FLOOR_DB]
+    return Spread(figures[:-1], np.array(floor))
 
 
 def _direction(u: float, v: float) -> Array:
