@@ -167,23 +167,8 @@ def row(name: str, trials: Sequence[Trial]) -> tuple[object, ...]:
 
 def main() -> int:
     rng = np.random.default_rng(2026)
-    header = (
-        "",
-        "dishes",
-        "covered %",
-        "+-",
-        "inside",
-        "rim",
-        "+-",
-        "terms",
-        "+-",
-        "error",
-        "sigma",
-        "rim error",
-        "rim sigma",
-        "csv",
-        "gap",
-    )
+    header = ("", "dishes", "covered %", "+-", "inside", "rim", "+-", "terms", "+-", "error", "sigma")
+    header += ("rim error", "rim sigma", "targets", "csv", "gap")
     every: list[Trial] = []
     rows = []
     for family in FAMILIES:
