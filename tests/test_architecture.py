@@ -79,6 +79,8 @@ ORDER = [
     *("rf.smooth_terms", "rf.smooth_fit", "rf.shape_field", "rf.shape_sources"),
     *("rf.aperture", "rf.feed", "rf.correction", "rf.subreflector", "rf.rays", "rf.sources", "rf.farfield"),
     *("rf.beam", "rf.gain", "rf.best_fit", "rf.spread", "rf.state"),
+    # and how the subreflector wins gain back
+    *("rf.surrogate", "rf.limits", "rf.climb", "rf.starts", "rf.correct"),
     # paper to print
     *("sheet.shapes", "sheet.pdf", "sheet.svg", "sheet.flatten", "sheet.pieces", "sheet.outline", "sheet.ruled"),
     *("sheet.seams", "sheet.gores", "sheet.markers"),

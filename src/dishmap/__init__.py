@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from dishmap.pipeline import map_photograph
     from dishmap.planning import Conditions, camera_of_lens, plan
     from dishmap.rf.antenna import Antenna
+    from dishmap.rf.correct import best_correction
     from dishmap.sheet.boards import charuco, chessboard
     from dishmap.sheet.paper import paper_of
     from dishmap.sheet.sheets import as_printed, board_sheets, pattern_sheets
@@ -77,6 +78,7 @@ _HOME = {
     "TargetKind": "dishmap.targets.pattern",
     "Upright": "dishmap.targets.identify",
     "as_printed": "dishmap.sheet.sheets",
+    "best_correction": "dishmap.rf.correct",
     "board_sheets": "dishmap.sheet.sheets",
     "calibrate": "dishmap.camera.calibrate",
     "camera_of_lens": "dishmap.planning",
@@ -140,6 +142,7 @@ __all__ = [
     "Upright",
     "__version__",
     "as_printed",
+    "best_correction",
     "board_sheets",
     "calibrate",
     "camera_of_lens",

@@ -17,8 +17,9 @@ from dishmap.rf.sources import Sources
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-# The peak is looked for on a grid that reaches so many times wavelength over diameter, in so fine steps.
+# The peak is looked for on a grid that reaches so many times wavelength over diameter, in so fine steps; nodes must resolve its corners.
 REACH, STEP = 6.0, 0.25
+FARTHEST = 0.7
 NEWTON_STEPS, STILL = 20, 1e-10
 # Cuts through the peak: how far and how finely, in wavelengths over diameters.
 CUT_REACH, CUT_STEP = 5.0, 0.05
@@ -56,6 +57,12 @@ def main_beam(sources: Sources, wavelength_mm: float, diameter_mm: float, polari
     widths, lobes = zip(*figures, strict=True)
     first, second = (float(np.degrees(w)) for w in widths)
     return Beam(u, v, float(power[0]), float(power[1]), (first, second), (lobes[0], lobes[1]), float(cross - power[0]))
+
+
+def beam_peak(sources: Sources, wavelength_mm: float, diameter_mm: float, polarization: str) -> tuple[float, float]:
+    """Direction (u, v) of the main beam's peak. Raises FitError when there is none near the boresight."""
+    u, v, _ = _coarse_peak(sources, wavelength_mm, wavelength_mm / diameter_mm, polarization)
+    return peak(sources, wavelength_mm, (u, v), polarization)
 
 
 def peak(sources: Sources, wavelength_mm: float, start: tuple[float, float], polarization: str) -> tuple[float, float]:
@@ -134,7 +141,7 @@ def cut_figures(angle_rad: Array, power_db: Array) -> tuple[float, float]:
 
 def _coarse_peak(sources: Sources, wavelength_mm: float, unit: float, polarization: str) -> tuple[float, float, float]:
     """The best direction of a grid about the boresight, and the largest cross-polar gain on it in dBi."""
-    reach = min(REACH * unit, 0.7)
+    reach = min(REACH * unit, FARTHEST)
     side = np.linspace(-reach, reach, 2 * int(np.ceil(reach / (STEP * unit))) + 1)
     grid = pattern_grid(sources, wavelength_mm, side, side, polarization)
     power = np.nan_to_num(np.abs(grid.co) ** 2)

@@ -16,7 +16,7 @@ from dishmap.errors import InputError
 from dishmap.rf.antenna import Antenna
 from dishmap.rf.correction import Correction
 from dishmap.rf.feed import FeedField, feed_field, radiated
-from dishmap.rf.subreflector import Patch, SubSurface, beyond_rim, local_xy, nominal_reflection, patch, shape_columns, sub_surface
+from dishmap.rf.subreflector import Patch, SubSurface, beyond_rim, local_xy, nominal_reflection, patch, shape_heights, sub_surface
 from dishmap.transforms import right_jacobian, rotation_from_vector
 
 Array = NDArray[np.float64]
@@ -74,15 +74,16 @@ def feed_place(antenna: Antenna) -> FeedPlace:
     return FeedPlace(center, rotation, feed_field(antenna.feed, edge, 1 if sub is None else 2))
 
 
-def trace(antenna: Antenna, feed: FeedPlace, points_mm: Array, correction: Correction) -> Rays:
+def trace(antenna: Antenna, feed: FeedPlace, points_mm: Array, correction: Correction, near_mm: Array | None = None) -> Rays:
     """Rays from the feed to points (N, 3) of the dish, after a correction.
 
-    Raises InputError when the subreflector would reach the dish or the feed.
+    near_mm (N, 3): points of reflection of a correction that differs little, which saves time. Raises InputError when the subreflector
+    would reach the dish or the feed.
     """
     if antenna.subreflector is None:
         return _straight(feed, points_mm, correction)
     surface = sub_surface(antenna, correction)
-    return _reflected(antenna, surface, feed, points_mm, correction)
+    return _reflected(antenna, surface, feed, points_mm, correction, near_mm)
 
 
 def _straight(feed: FeedPlace, points: Array, correction: Correction) -> Rays:
@@ -97,9 +98,11 @@ def _straight(feed: FeedPlace, points: Array, correction: Correction) -> Rays:
     return Rays(path, direction, field, by, np.zeros(len(points), bool), np.full_like(points, np.nan))
 
 
-def _reflected(antenna: Antenna, surface: SubSurface, feed: FeedPlace, points: Array, correction: Correction) -> Rays:
+def _reflected(
+    antenna: Antenna, surface: SubSurface, feed: FeedPlace, points: Array, correction: Correction, near: Array | None
+) -> Rays:
     assert antenna.subreflector is not None
-    xy = local_xy(surface, nominal_reflection(antenna.reflector, antenna.subreflector, points))
+    xy = local_xy(surface, nominal_reflection(antenna.reflector, antenna.subreflector, points) if near is None else near)
     xy, found, here = _stationary(surface, feed.center_mm, points, xy)
     a, b, d1, d2 = _ways(here.point_mm, feed.center_mm, points)
     hessian = _hessian(here, a, b, d1, d2)
@@ -121,7 +124,8 @@ def _stationary(surface: SubSurface, start: Array, points: Array, xy: Array) -> 
     for _ in range(STEPS):
         here = patch(surface, xy)
         a, b, d1, d2 = _ways(here.point_mm, start, points)
-        gradient = np.einsum("nij,ni->nj", here.first, a - b)
+        gap = a - b
+        gradient = np.stack([_dot(here.first[:, :, 0], gap), _dot(here.first[:, :, 1], gap)], axis=1)
         step = -_solve(_hessian(here, a, b, d1, d2), gradient[..., None])[..., 0]
         long = np.linalg.norm(step, axis=1, keepdims=True)
         xy = xy + step * np.minimum(1.0, reach / np.maximum(long, 1e-300))
@@ -138,12 +142,20 @@ def _ways(q: Array, start: Array, points: Array) -> tuple[Array, Array, Array, A
 
 def _hessian(here: Patch, a: Array, b: Array, d1: Array, d2: Array) -> Array:
     """Second derivative (N, 2, 2) of the path to the point of reflection."""
-    bent = np.einsum("nijk,ni->njk", here.second, a - b)
-    flat = np.zeros_like(bent)
-    for way, distance in ((a, d1), (b, d2)):
-        along = np.einsum("nij,ni->nj", here.first, way)
-        flat += (np.einsum("nij,nik->njk", here.first, here.first) - along[:, :, None] * along[:, None, :]) / distance[:, None, None]
-    return np.asarray(bent + flat)
+    e, f = np.ascontiguousarray(here.first[:, :, 0]), np.ascontiguousarray(here.first[:, :, 1])
+    a_e, a_f, b_e, b_f = _dot(a, e), _dot(a, f), _dot(b, e), _dot(b, f)
+    bow = (a - b) @ here.axis
+    both = 1 / d1 + 1 / d2
+    out = np.empty((len(a), 2, 2))
+    out[:, 0, 0] = bow * here.bend[:, 0, 0] + _dot(e, e) * both - a_e**2 / d1 - b_e**2 / d2
+    out[:, 1, 1] = bow * here.bend[:, 1, 1] + _dot(f, f) * both - a_f**2 / d1 - b_f**2 / d2
+    out[:, 0, 1] = out[:, 1, 0] = bow * here.bend[:, 0, 1] + _dot(e, f) * both - a_e * a_f / d1 - b_e * b_f / d2
+    return out
+
+
+def _dot(p: Array, q: Array) -> Array:
+    """Products (N,) of vectors (N, 3)."""
+    return np.asarray(p[:, 0] * q[:, 0] + p[:, 1] * q[:, 1] + p[:, 2] * q[:, 2])
 
 
 def _concentration(here: Patch, hessian: Array, a: Array, b: Array, d1: Array, d2: Array) -> Array:
@@ -169,7 +181,7 @@ def _by_values(surface: SubSurface, here: Patch, xy: Array, gap: Array, correcti
     spin = right_jacobian([*-np.radians(correction.tilt_deg), 0.0])[:, :2] * np.radians(1.0)
     out[:, 3:5] = np.cross(arm, gap) @ spin
     if surface.terms:
-        out[:, 5:] = np.einsum("ni,nit->nt", gap, shape_columns(surface, xy))
+        out[:, 5:] = (gap @ surface.rotation[:, 2])[:, None] * shape_heights(surface, xy)
     return out
 
 
@@ -186,7 +198,11 @@ def _check_clear(antenna: Antenna, feed: FeedPlace, points: Array) -> None:
 
 
 def _solve(matrix: Array, right: Array) -> Array:
-    """Solutions (N, 2, K) of two equations each: numpy's own loop is slow for so many small ones."""
-    (p, q), (r, s) = np.moveaxis(matrix, 0, -1)
-    inverse = np.stack([np.stack([s, -q], axis=-1), np.stack([-r, p], axis=-1)], axis=1)
-    return np.asarray(inverse @ right / (p * s - q * r)[:, None, None])
+    """Solutions (N, 2, K) of two equations each, matrices symmetric: numpy's own loop is slow for so many small ones."""
+    p, q, s = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 1]
+    scale = 1 / (p * s - q * q)
+    first, second = right[:, 0], right[:, 1]
+    out = np.empty_like(right)
+    out[:, 0] = (scale * s)[:, None] * first - (scale * q)[:, None] * second
+    out[:, 1] = (scale * p)[:, None] * second - (scale * q)[:, None] * first
+    return out

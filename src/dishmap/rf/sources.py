@@ -16,7 +16,7 @@ from dishmap.rf.antenna import Antenna
 from dishmap.rf.aperture import ApertureNodes, aperture_nodes
 from dishmap.rf.correction import Correction
 from dishmap.rf.deformation import Deformation, displacement
-from dishmap.rf.rays import Rays, feed_place, trace
+from dishmap.rf.rays import FeedPlace, Rays, feed_place, trace
 from dishmap.rf.subreflector import rim_disc
 
 Array = NDArray[np.float64]
@@ -46,6 +46,20 @@ class Sources:
     moment: Complex
     rays: Rays
     arriving: Array
+
+
+@dataclass(frozen=True)
+class Illuminated:
+    """What stays as it is while the actuators move: the deformed dish at its nodes, and the feed.
+
+    point_mm, area_mm2, normal (N, 3), as `deformed_surface` gives them.
+    """
+
+    nodes: ApertureNodes
+    point_mm: Array
+    area_mm2: Array
+    normal: Array
+    feed: FeedPlace
 
 
 def wavelength_of(antenna: Antenna, frequency_ghz: float) -> float:
@@ -100,13 +114,22 @@ def _steepest(antenna: Antenna, deformation: Deformation) -> Array:
     return np.array([outwards.max(), around.max()])
 
 
+def illuminated(antenna: Antenna, deformation: Deformation, nodes: ApertureNodes) -> Illuminated:
+    """The deformed dish and the feed, ready for `sources_after` any correction."""
+    return Illuminated(nodes, *deformed_surface(antenna, deformation, nodes), feed_place(antenna))
+
+
 def sources(antenna: Antenna, deformation: Deformation, correction: Correction, nodes: ApertureNodes) -> Sources:
     """Currents on the deformed dish, after a correction. Raises InputError when the subreflector would reach the dish or the feed."""
-    points, area, normal = deformed_surface(antenna, deformation, nodes)
-    rays = trace(antenna, feed_place(antenna), points, correction)
-    moment = 2 * np.cross(area, np.cross(rays.direction, rays.field))
-    arriving = -(rays.direction * area).sum(axis=1) * (np.abs(rays.field) ** 2).sum(axis=1)
-    return Sources(nodes, normal, points, moment, rays, arriving)
+    return sources_after(antenna, illuminated(antenna, deformation, nodes), correction)
+
+
+def sources_after(antenna: Antenna, dish: Illuminated, correction: Correction, near_mm: Array | None = None) -> Sources:
+    """Currents on a dish that was prepared, after a correction; near_mm as in `trace`. Raises InputError as `sources` does."""
+    rays = trace(antenna, dish.feed, dish.point_mm, correction, near_mm)
+    moment = 2 * np.cross(dish.area_mm2, np.cross(rays.direction, rays.field))
+    arriving = -(rays.direction * dish.area_mm2).sum(axis=1) * (np.abs(rays.field) ** 2).sum(axis=1)
+    return Sources(dish.nodes, dish.normal, dish.point_mm, moment, rays, arriving)
 
 
 def deformed_surface(antenna: Antenna, deformation: Deformation, nodes: ApertureNodes) -> tuple[Array, Array, Array]:

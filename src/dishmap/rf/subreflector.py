@@ -40,11 +40,15 @@ class SubSurface:
 
 @dataclass(frozen=True)
 class Patch:
-    """Points (N, 3) of a subreflector in the dish frame with derivatives over its own x, y: first (N, 3, 2), second (N, 3, 2, 2)."""
+    """Points (N, 3) of a subreflector in the dish frame, with derivatives over its own x, y.
+
+    first (N, 3, 2); the second ones are bend (N, 2, 2) along its axis (3,).
+    """
 
     point_mm: Array
     first: Array
-    second: Array
+    bend: Array
+    axis: Array
 
 
 def sub_surface(antenna: Antenna, correction: Correction) -> SubSurface:
@@ -103,21 +107,14 @@ def patch(surface: SubSurface, xy_mm: Array) -> Patch:
         for own, extra in zip((height, slope, bend), _shape(surface, xy_mm), strict=True):
             own += extra
     local = np.concatenate([xy_mm, height[:, None]], axis=1)
-    first = np.zeros((len(xy_mm), 3, 2))
-    first[:, 0, 0] = first[:, 1, 1] = 1.0
-    first[:, 2] = slope
     turn = surface.rotation
-    return Patch(
-        surface.vertex_mm + local @ turn.T,
-        np.einsum("ij,njk->nik", turn, first),
-        turn[:, 2][None, :, None, None] * bend[:, None],
-    )
+    first = turn[None, :, :2] + turn[None, :, 2:] * slope[:, None, :]
+    return Patch(surface.vertex_mm + local @ turn.T, first, bend, turn[:, 2])
 
 
-def shape_columns(surface: SubSurface, xy_mm: Array) -> Array:
-    """Displacement (N, 3, T) in the dish frame of unit shape terms at own x, y (N, 2)."""
-    x, y = _disc_xy(surface, xy_mm)
-    return np.asarray(surface.rotation[:, 2][None, :, None] * zernike_matrix(surface.terms, x, y)[:, None, :])
+def shape_heights(surface: SubSurface, xy_mm: Array) -> Array:
+    """Heights (N, T) of unit shape terms at own x, y (N, 2), along the subreflector's axis."""
+    return zernike_matrix(surface.terms, *_disc_xy(surface, xy_mm))
 
 
 def beyond_rim(surface: SubSurface, xy_mm: Array) -> NDArray[np.bool_]:
