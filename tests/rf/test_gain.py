@@ -128,5 +128,7 @@ def test_sigmas_of_the_best_fit_are_those_of_fits_to_drawn_surfaces() -> None:
 
 def test_a_surface_without_any_paraboloid_is_refused() -> None:
     wild = Deformation(((2, 0),), np.array([-4000.0]), np.zeros(2), 300.0)
+    nodes = sampled(PRIME, undeformed(PRIME.reflector), 10.0)
+    made = sources(PRIME, wild, no_correction(PRIME), nodes)
     with pytest.raises(FitError, match="did not converge"):
-        fitted(wild)
+        best_fit(PRIME, wild, made, np.zeros((1, 1)))

@@ -91,3 +91,9 @@ def test_subreflectors_that_enter_the_dish() -> None:
     d = Deformation((), np.zeros(0), np.zeros(2), 300.0)
     with pytest.raises(InputError, match=r"mm into the dish; give it a shorter stroke"):
         sources(whole, d, Correction(np.array([0, 0, -290.0]), np.zeros(2), np.zeros(0)), sampled(whole, d, wavelength))
+
+
+def test_shapes_in_the_wrong_units_are_refused_before_they_fill_the_memory() -> None:
+    whole = Antenna(DISH, FEED)
+    with pytest.raises(InputError, match=r"phases over the aperture reach .* radians.*check the units of the shape"):
+        sampled(whole, Deformation(((2, 2), (4, 0)), np.array([4000.0, 900.0]), np.zeros(2), 300.0), 10.0)

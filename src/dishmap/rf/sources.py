@@ -28,6 +28,8 @@ LEAST_WAVELENGTHS = 3.0
 # Rings and spokes of the quadrature: for the illumination, for each radian of phase at the rim (towards the widest direction wanted, plus
 # what the steepest part of the deformation adds), and for each degree of the deformation.
 RINGS, SPOKES = (24, 0.6, 1), (64, 1.3, 3)
+# More nodes than these come of a mistake in the input: a dish of 1 m at 30 GHz, several mm out of shape, takes a hundredth of them.
+MOST_NODES = 2_000_000
 # Half the angular width of the beam is about this over the diameter in wavelengths.
 BEAM = 0.6
 
@@ -78,13 +80,21 @@ def wavelength_of(antenna: Antenna, frequency_ghz: float) -> float:
 
 
 def sampled(antenna: Antenna, deformation: Deformation, wavelength_mm: float, widest: float = 0.0) -> ApertureNodes:
-    """Nodes fine enough for directions up to `widest` (sine of the angle from the boresight), at least for the main beam."""
+    """Nodes fine enough for directions up to `widest` (sine of the angle from the boresight), at least for the main beam.
+
+    Raises InputError when that takes more than MOST_NODES.
+    """
     widest = max(widest, 3 * BEAM * wavelength_mm / antenna.reflector.diameter_mm)
     wavenumber, degree = 2 * np.pi / wavelength_mm, max((n for n, _ in deformation.terms), default=0)
     phase = wavenumber * antenna.reflector.diameter_mm / 2 * widest
     steep = 2 * wavenumber * _steepest(antenna, deformation)
     counts = [base + slope * (phase + extra) + bent * degree for (base, slope, bent), extra in zip((RINGS, SPOKES), steep, strict=True)]
     rings, spokes = (int(np.ceil(count)) for count in counts)
+    if rings * spokes > MOST_NODES:
+        raise InputError(
+            f"phases over the aperture reach {max(phase, *steep):.3g} radians, which would take {rings * spokes:.2g} currents to sum; "
+            "check the units of the shape and of the antenna, or ask for a lower frequency or a narrower pattern"
+        )
     return aperture_nodes(antenna, rings, spokes, *shadow_mm(antenna))
 
 
