@@ -80,7 +80,7 @@ ORDER = [
     *("rf.aperture", "rf.feed", "rf.correction", "rf.subreflector", "rf.rays", "rf.sources", "rf.farfield"),
     *("rf.beam", "rf.gain", "rf.best_fit", "rf.spread", "rf.state"),
     # and how the subreflector wins gain back
-    *("rf.surrogate", "rf.limits", "rf.climb", "rf.starts", "rf.correct"),
+    *("rf.surrogate", "rf.limits", "rf.climb", "rf.starts", "rf.correct", "rf.modes", "rf.margin"),
     # paper to print
     *("sheet.shapes", "sheet.pdf", "sheet.svg", "sheet.flatten", "sheet.pieces", "sheet.outline", "sheet.ruled"),
     *("sheet.seams", "sheet.gores", "sheet.markers"),

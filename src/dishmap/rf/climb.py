@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.errors import InputError
+from dishmap.rf.beam import FARTHEST, REACH
 from dishmap.rf.limits import Limits, best_step, whole
 from dishmap.rf.surrogate import Traced, Tracer, co_moment, fading, gain_dbi, lobe
 
@@ -50,6 +51,12 @@ class Aim:
     def extra(self) -> int:
         """How many unknowns beside the actuators."""
         return 2 * len(self.wavenumbers) if self.free else 0
+
+
+def aim_of(wavelengths_mm: Array, diameter_mm: float, free: bool) -> Aim:
+    """The aim for wavelengths (F,) and an aperture, with directions inside those where a main beam is looked for."""
+    unit = float(wavelengths_mm.min() / diameter_mm)
+    return Aim(2 * np.pi / wavelengths_mm, free, unit, min((REACH - 1) * unit, FARTHEST / 2))
 
 
 @dataclass(frozen=True)
@@ -96,10 +103,10 @@ def _stepped(
 ) -> tuple[Place | None, float, bool]:
     """The next place, or None where there is no better one; the damping; whether it is because nothing is left to gain."""
     scale = np.concatenate([limits.scale, np.full(aim.extra, aim.unit)])
-    slope, bend = _model(here, aim, limits, fade)
+    slope, bend = model(here, aim, limits, fade)
     level = _level(here, here, aim) + _ridge(here, limits)
     while damping < HOPELESS:
-        curved = _convex(bend * np.outer(scale, scale), damping)
+        curved = convex(bend * np.outer(scale, scale), damping)
         step = best_step(slope * scale, curved, limits, here.values, here.uv.ravel()[: aim.extra], scale, aim.reach)
         if abs(slope @ step) < SETTLED_DB:
             return None, damping, True
@@ -133,7 +140,7 @@ def _moved(trace: Tracer, here: Place, aim: Aim, limits: Limits, step: Array) ->
         return None
 
 
-def _model(here: Place, aim: Aim, limits: Limits, fade: Complex | None) -> tuple[Array, Array]:
+def model(here: Place, aim: Aim, limits: Limits, fade: Complex | None) -> tuple[Array, Array]:
     """Slope (Q,) and second derivatives (Q, Q) of what is minimised."""
     count = len(here.values)
     slope, bend = np.zeros(count + aim.extra), np.zeros((count + aim.extra,) * 2)
@@ -148,7 +155,7 @@ def _model(here: Place, aim: Aim, limits: Limits, fade: Complex | None) -> tuple
     return slope, bend
 
 
-def _convex(bend: Array, damping: float) -> Array:
+def convex(bend: Array, damping: float) -> Array:
     """Second derivatives with their signs made positive, so that a step leads downhill also from a saddle."""
     values, vectors = np.linalg.eigh(bend)
     return np.asarray((vectors * np.maximum(np.abs(values) + damping, FLAT_DB)) @ vectors.T)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dishmap.errors import InputError
 from dishmap.rf.antenna import Antenna
 from dishmap.rf.beam import FARTHEST, REACH, beam_peak
-from dishmap.rf.climb import Aim, Summit, climb
+from dishmap.rf.climb import Aim, Summit, aim_of, climb
 from dishmap.rf.correction import RIGID, Correction, correction_of, no_correction
 from dishmap.rf.deformation import Deformation
 from dishmap.rf.farfield import far_field
@@ -86,8 +86,7 @@ def best_correction(
     if not len(frequencies_ghz):
         raise InputError("a correction needs at least one frequency in GHz")
     wavelengths = np.array([wavelength_of(antenna, f) for f in frequencies_ghz])
-    unit = float(wavelengths.min() / antenna.reflector.diameter_mm)
-    aim = Aim(2 * np.pi / wavelengths, pointing == "free", unit, min((REACH - 1) * unit, FARTHEST / 2))
+    aim = aim_of(wavelengths, antenna.reflector.diameter_mm, pointing == "free")
     trace = tracer(antenna, illuminated(antenna, deformation, sampled(antenna, deformation, float(wavelengths.min()))))
     before, before_uv = judged(antenna, deformation, no_correction(antenna), wavelengths, aim.free)
     summit, ends = _highest(trace, aim, limits_of(antenna.actuators, shape), progress)

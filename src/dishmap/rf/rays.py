@@ -98,9 +98,7 @@ def _straight(feed: FeedPlace, points: Array, correction: Correction) -> Rays:
     return Rays(path, direction, field, by, np.zeros(len(points), bool), np.full_like(points, np.nan))
 
 
-def _reflected(
-    antenna: Antenna, surface: SubSurface, feed: FeedPlace, points: Array, correction: Correction, near: Array | None
-) -> Rays:
+def _reflected(antenna: Antenna, surface: SubSurface, feed: FeedPlace, points: Array, correction: Correction, near: Array | None) -> Rays:
     assert antenna.subreflector is not None
     xy = local_xy(surface, nominal_reflection(antenna.reflector, antenna.subreflector, points) if near is None else near)
     xy, found, here = _stationary(surface, feed.center_mm, points, xy)

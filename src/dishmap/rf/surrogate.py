@@ -39,7 +39,7 @@ class Traced:
     """The antenna with its actuators in one place.
 
     values (P,): of the actuators; path_mm (N,); by_values (N, P): its derivatives; point_mm (N, 3); moment (N, 3), zero where no ray
-    arrives; reflection_mm (N, 3): on the subreflector; polarization: of the beam.
+    arrives; reflection_mm (N, 3): on the subreflector; direction (N, 3): of arrival; polarization: of the beam.
     """
 
     values: Array
@@ -48,6 +48,7 @@ class Traced:
     point_mm: Array
     moment: Complex
     reflection_mm: Array
+    direction: Array
     polarization: str
 
 
@@ -75,7 +76,8 @@ def tracer(antenna: Antenna, dish: Illuminated) -> Tracer:
         start = None if near is None else near.reflection_mm
         found = sources_after(antenna, dish, correction_of(values), start)
         rays = found.rays
-        return Traced(values, rays.path_mm, rays.by_values, found.point_mm, found.moment, rays.reflection_mm, antenna.feed.polarization)
+        wanted = antenna.feed.polarization
+        return Traced(values, rays.path_mm, rays.by_values, found.point_mm, found.moment, rays.reflection_mm, rays.direction, wanted)
 
     return traced
 

@@ -1,0 +1,172 @@
+"""Gain left on the table because the map is not exact: corrections made from noisy maps, judged on the true dish.
+
+About the correction made from the truth, the best values follow the map linearly (implicit function theorem): with z the unknowns and c the
+coefficients of the map, dz = -H_zz^-1 H_zc dc, H the second derivatives of the gain, within the limits. Where the noise is too large for
+that, each map's correction is climbed to, on linear paths. What each correction gives on the true dish is the whole sum over the aperture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from dishmap.errors import InputError
+from dishmap.rf.antenna import Antenna
+from dishmap.rf.beam import log_gain_slopes
+from dishmap.rf.climb import Aim, Place, aim_of, climb, convex, model
+from dishmap.rf.correct import CorrectionFound
+from dishmap.rf.deformation import Deformation
+from dishmap.rf.limits import Limits, best_step, limits_of, whole
+from dishmap.rf.sources import illuminated, sampled, wavelength_of
+from dishmap.rf.surrogate import DB, Traced, co_moment, direction_of, fading, gain_dbi, linear_tracer, phase_slopes, tracer
+from dishmap.surface.zernike import zernike_matrix
+
+Array = NDArray[np.float64]
+
+# Maps whose noise changes phases by more (rms, rad) are climbed for, one by one.
+LINEAR_RAD = 0.5
+POINTING_STEPS = 4
+# A value this near to its limit, as a share of the stroke, is held by it.
+HELD = 1e-3
+
+
+@dataclass(frozen=True)
+class Margin:
+    """Loss of gain in dB against the correction made from the truth, for S sigmas of each target and F frequencies.
+
+    mean_db, high_db (S, F): mean and 90th percentile over draws; linear (S,): whether the linear response was used.
+    """
+
+    sigma_mm: Array
+    frequencies_ghz: tuple[float, ...]
+    mean_db: Array
+    high_db: Array
+    linear: NDArray[np.bool_]
+
+
+def gain_margin(
+    antenna: Antenna,
+    deformation: Deformation,
+    found: CorrectionFound,
+    terms: Sequence[tuple[int, int]],
+    response: Array,
+    sigmas_mm: Sequence[float],
+    rng: Generator,
+    draws: int = 100,
+) -> Margin:
+    """What noise of the map costs the correction `found` for a deformation that is taken as the truth.
+
+    response (T, N): coefficients of the terms (T), on the deformation's disc, for each mm of displacement at each of N targets; sigmas_mm:
+    of each target, independent. Whether the shape moves is as in `found`. Raises InputError for a response that does not fit its terms.
+    """
+    if response.ndim != 2 or len(response) != len(terms):
+        raise InputError(f"the response must have a row for each of the {len(terms)} terms, not the shape {response.shape}")
+    shaped = bool(found.correction.shape_mm.any())
+    limits = limits_of(antenna.actuators, shaped)
+    about = _about(antenna, deformation, found, limits, terms)
+    unit = rng.standard_normal((draws, response.shape[1])) @ response.T
+    mean, high, linear = [], [], []
+    for sigma in sigmas_mm:
+        small = bool(sigma * _phase_rms(about, unit) < LINEAR_RAD)
+        losses = np.array([_loss(about, limits, sigma * change, small) for change in unit])
+        mean.append(losses.mean(axis=0))
+        high.append(np.percentile(losses, 90, axis=0))
+        linear.append(small)
+    return Margin(np.array(sigmas_mm, float), found.frequencies_ghz, np.array(mean), np.array(high), np.array(linear))
+
+
+@dataclass(frozen=True)
+class _About:
+    """The true dish under its best correction: where it is, how paths (N, T) follow the map, and the quadratic model there."""
+
+    place: Place
+    aim: Aim
+    by_map: Array
+    slope: Array
+    bend: Array
+    mixed: Array
+    best_dbi: Array
+
+
+def _about(antenna: Antenna, deformation: Deformation, found: CorrectionFound, limits: Limits, terms: Sequence[tuple[int, int]]) -> _About:
+    wavelengths = np.array([wavelength_of(antenna, f) for f in found.frequencies_ghz])
+    nodes = sampled(antenna, deformation, float(wavelengths.min()))
+    dish = illuminated(antenna, deformation, nodes)
+    trace = tracer(antenna, dish)
+    here = trace(found.correction.values)
+    place = Place(found.correction.values[limits.used], found.after_uv, here)
+    aim = aim_of(wavelengths, antenna.reflector.diameter_mm, found.pointing == "free")
+    fade = None if len(limits.heights) else fading(trace, here, limits.used, limits.scale)
+    slope, bend = model(place, aim, limits, fade)
+    # at the best place only limits hold back what the slope asks for; the rest of it is rounding of the search
+    held = np.zeros(len(slope), bool)
+    held[: len(limits.used)] = np.abs(place.values) > (1 - HELD) * limits.scale
+    if not len(limits.heights) or np.abs(limits.heights @ place.values).max() < (1 - HELD) * limits.stroke_mm:
+        slope = np.where(held, slope, 0.0)
+    x, y = ((nodes.xy_mm - deformation.center_mm) / deformation.radius_mm).T
+    # a rise along the normal changes the path by n . (b - r); b is the direction in which the path grows with the point
+    towards = here.direction - np.array([0.0, 0.0, 1.0])
+    by_map = (dish.normal * towards).sum(axis=1)[:, None] * zernike_matrix(tuple(terms), x, y)
+    mixed = _mixed(place, aim, limits, by_map)
+    best = np.array([_peak_dbi(here, here, k, uv, aim.free) for k, uv in zip(aim.wavenumbers, place.uv, strict=True)])
+    return _About(place, aim, by_map, slope, bend, mixed, best)
+
+
+def _mixed(place: Place, aim: Aim, limits: Limits, by_map: Array) -> Array:
+    """Derivatives (Q, T) of the slope of what is minimised to the map's coefficients."""
+    count = len(place.values)
+    out = np.zeros((count + aim.extra, by_map.shape[1]))
+    for i, (k, uv) in enumerate(zip(aim.wavenumbers, place.uv, strict=True)):
+        r = direction_of(uv)
+        share = co_moment(place.traced, uv) * np.exp(1j * k * (place.traced.point_mm @ r - place.traced.path_mm))
+        share = share / share.sum()
+        own, other = k * phase_slopes(place.traced, r, limits.used), -k * by_map
+        covariance = (own * share.real[:, None]).T @ other - ((share @ own)[:, None] * (share @ other)[None, :]).real
+        to = [*range(count), count + 2 * i, count + 2 * i + 1] if aim.free else [*range(count)]
+        out[to] += 2 * DB / len(aim.wavenumbers) * covariance[: len(to)]
+    return out
+
+
+def _loss(about: _About, limits: Limits, change: Array, small: bool) -> Array:
+    """Loss (F,) of the correction that a map off by coefficients (T,) asks for."""
+    here, aim, count = about.place, about.aim, len(limits.used)
+    if small:
+        scale = np.concatenate([limits.scale, np.full(aim.extra, aim.unit)])
+        slope = (about.slope + about.mixed @ change) * scale
+        turned = here.uv.ravel()[: aim.extra]
+        step = best_step(slope, convex(about.bend * np.outer(scale, scale), 0.0), limits, here.values, turned, scale, aim.reach)
+        values = here.values + step[:count]
+    else:
+        seen = replace(here.traced, path_mm=here.traced.path_mm + about.by_map @ change)
+        values = climb(linear_tracer(seen), aim, limits, here.values, here.uv, fades=False).values
+    there = linear_tracer(here.traced)(whole(limits, values))
+    # the beam follows the actuators; Newton's method finds its peak from where it went to the first order
+    follow = -np.linalg.solve(about.bend[count:, count:], about.bend[count:, :count] @ (values - here.values)).reshape(-1, 2)
+    turned_uv = here.uv + follow if aim.free else here.uv
+    now = [_peak_dbi(there, here.traced, k, uv, aim.free) for k, uv in zip(aim.wavenumbers, turned_uv, strict=True)]
+    return about.best_dbi - np.array(now)
+
+
+def _peak_dbi(traced: Traced, lit: Traced, k: float, uv: Array, free: bool) -> float:
+    """Gain at the peak near a direction, or towards it where the pointing is fixed."""
+    moment = co_moment(lit, uv)
+    x, y, z = traced.point_mm.T
+    for _ in range(POINTING_STEPS if free else 0):
+        r = direction_of(uv)
+        wave = moment * np.exp(1j * k * (traced.point_mm @ r - traced.path_mm))
+        gradient, hessian = log_gain_slopes(wave, k, x - z * r[0] / r[2], y - z * r[1] / r[2])
+        values, vectors = np.linalg.eigh(hessian)
+        uv = uv + vectors @ ((vectors.T @ gradient) / np.maximum(np.abs(values), 1e-300))
+    return gain_dbi(traced, moment, k, uv)
+
+
+def _phase_rms(about: _About, unit: Array) -> float:
+    """Phase (rad, weighted rms over aperture and draws) that maps with coefficients (D, T) add at the highest frequency."""
+    weight = np.linalg.norm(about.place.traced.moment, axis=1)
+    path = about.by_map @ unit.T
+    path = path - weight @ path / weight.sum()
+    return float(about.aim.wavenumbers.max() * np.sqrt((weight @ path**2 / weight.sum()).mean()))
