@@ -81,6 +81,7 @@ ORDER = [
     *("rf.beam", "rf.gain", "rf.best_fit", "rf.spread", "rf.state"),
     # and how the subreflector wins gain back
     *("rf.surrogate", "rf.limits", "rf.climb", "rf.starts", "rf.correct", "rf.modes", "rf.margin"),
+    *("rf.goals", "rf.target_beam"),
     # paper to print
     *("sheet.shapes", "sheet.pdf", "sheet.svg", "sheet.flatten", "sheet.pieces", "sheet.outline", "sheet.ruled"),
     *("sheet.seams", "sheet.gores", "sheet.markers"),

@@ -51,7 +51,7 @@ def modes_of(xy: Array, half_path_mm: Array, weight: Array, wavelength_mm: float
     columns = zernike_matrix(terms, *xy.T)
     root = np.sqrt(np.abs(weight))[:, None]
     values = np.linalg.lstsq(columns * root, half_path_mm * root[:, 0], rcond=None)[0]
-    own = {}
+    own: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for i, (n, m) in enumerate(terms):
         if n > 1:
             own.setdefault((n, abs(m)), []).append((i, m))

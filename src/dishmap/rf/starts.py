@@ -55,10 +55,13 @@ class Best:
     reach_mm: Array
 
 
-def least_squares(trace: Tracer, aim: Aim, limits: Limits) -> Best:
-    """Values and a direction whose paths are most alike, weighed by the amplitude, within the limits."""
+def least_squares(trace: Tracer, aim: Aim, limits: Limits, towards: Array | None = None) -> Best:
+    """Values and a direction whose paths are most alike, weighed by the amplitude, within the limits.
+
+    towards (2,): the direction where it starts, and where it stays if the aim is not free; None for the boresight.
+    """
     count, free = len(limits.used), 2 if aim.free else 0
-    values, uv = np.zeros(count), np.zeros(2)
+    values, uv = np.zeros(count), np.zeros(2) if towards is None else towards
     scale = np.concatenate([limits.scale, np.full(free, aim.unit)])
     here = trace(whole(limits, values))
     for _ in range(STEPS):
@@ -90,7 +93,7 @@ def starts_around(best: Best, trace: Tracer, aim: Aim, limits: Limits) -> list[S
     useful = best.ways[best.reach_mm > WAVES * shortest / 4]
     ways = [np.array(signs) @ useful[: len(signs)] for signs in product((-1, 0, 1), repeat=min(COMBINED, len(useful))) if any(signs)]
     ways += [2 * sign * way for way in useful[:ALONE] for sign in (-1, 1)]
-    return starts + [_left(best, WAVES * shortest * way, aim, limits) for way in ways]
+    return starts + [away(best, WAVES * shortest * way, aim, limits) for way in ways]
 
 
 def _chained(best: Best, trace: Tracer, aim: Aim, limits: Limits) -> Start:
@@ -115,11 +118,12 @@ def _weighted(here: Traced, limits: Limits, uv: Array, free: bool) -> tuple[Arra
 def _ways(slopes: Array, weight: Array, limits: Limits, free: int) -> tuple[Array, Array]:
     """The principal ways in which the actuators change paths, with the pointing that follows them."""
     count = len(limits.used)
-    own, turn = slopes[:, :count] * limits.scale, slopes[:, count:]
+    own = np.asarray(slopes[:, :count] * limits.scale, dtype=float)
+    turn = slopes[:, count:]
     follow = np.zeros((free, count))
     if free:
         follow = -np.linalg.solve(turn.T @ (weight[:, None] * turn), turn.T @ (weight[:, None] * own))
-        own = own + turn @ follow
+        own += turn @ follow
     square, vectors = np.linalg.eigh(own.T @ (weight[:, None] * own))
     order = np.argsort(square)[::-1]
     reach = np.sqrt(np.maximum(square[order], 1e-30))
@@ -128,7 +132,7 @@ def _ways(slopes: Array, weight: Array, limits: Limits, free: int) -> tuple[Arra
     return both.T, reach
 
 
-def _left(best: Best, way: Array, aim: Aim, limits: Limits) -> Start:
+def away(best: Best, way: Array, aim: Aim, limits: Limits) -> Start:
     """The answer left along a way, as far as the limits allow."""
     count = len(limits.used)
     values, step = best.start.values, way[:count]
