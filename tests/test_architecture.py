@@ -82,6 +82,7 @@ ORDER = [
     # and how the subreflector wins gain back
     *("rf.surrogate", "rf.limits", "rf.climb", "rf.starts", "rf.correct", "rf.modes", "rf.margin"),
     *("rf.goals", "rf.target_beam"),
+    "rf.analysis",
     # paper to print
     *("sheet.shapes", "sheet.pdf", "sheet.svg", "sheet.flatten", "sheet.pieces", "sheet.outline", "sheet.ruled"),
     *("sheet.seams", "sheet.gores", "sheet.markers"),
