@@ -17,6 +17,7 @@ from dishmap.surface.zernike import (
     zernike,
     zernike_gradient,
     zernike_matrix,
+    zernike_sum,
     zernike_terms,
     zernike_xy,
 )
@@ -103,6 +104,23 @@ def test_gradient_equals_differences(term: tuple[int, int], x: float, y: float) 
     assert by_y == pytest.approx(
         (zernike_xy(*term, x, y + step) - zernike_xy(*term, x, y - step)) / (2 * step), abs=DIFFERENCE_TOLERANCE * scale, rel=1e-6
     )
+
+
+def test_matrix_and_sum_equal_the_terms_one_by_one() -> None:
+    # recurrences lose a digit in ten degrees
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(-1.05, 1.05, (2, 200))
+    x[0] = y[0] = 0.0
+    terms = zernike_terms(30)[::-1]
+    each = np.stack([zernike_xy(n, m, x, y) for n, m in terms], axis=-1)
+    assert np.abs(zernike_matrix(terms, x, y) - each).max() < 1e-10 * np.abs(each).max()
+    coefficients = rng.normal(size=len(terms))
+    slopes = np.stack([np.stack(zernike_gradient(n, m, x, y), axis=-1) for n, m in terms], axis=-1)
+    value, gradient = zernike_sum(terms, coefficients, x, y)
+    assert np.abs(value - each @ coefficients).max() < 1e-10 * np.abs(each).max()
+    assert np.abs(gradient - slopes @ coefficients).max() < 1e-10 * np.abs(slopes).max()
+    assert zernike_matrix((), x, y).shape == (200, 0)
+    assert not zernike_sum((), (), x, y)[1].any()
 
 
 def test_gradient_is_finite_at_the_origin() -> None:

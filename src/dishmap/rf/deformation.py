@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dishmap.rf.antenna import Reflector
-from dishmap.surface.zernike import zernike_gradient, zernike_matrix
+from dishmap.surface.zernike import zernike_sum
 
 Array = NDArray[np.float64]
 
@@ -34,9 +34,5 @@ def undeformed(reflector: Reflector) -> Deformation:
 def displacement(deformation: Deformation, xy_mm: ArrayLike) -> tuple[Array, Array]:
     """Displacement (N,) in mm at nominal places (N, 2), and its gradient (N, 2) over x and y."""
     x, y = ((np.asarray(xy_mm, dtype=float) - deformation.center_mm) / deformation.radius_mm).T
-    value = zernike_matrix(deformation.terms, x, y) @ deformation.coefficients_mm
-    gradient = np.zeros((len(x), 2))
-    for (n, m), coefficient in zip(deformation.terms, deformation.coefficients_mm, strict=True):
-        if n and coefficient:
-            gradient += np.stack(zernike_gradient(n, m, x, y), axis=1) * (coefficient / deformation.radius_mm)
-    return value, gradient
+    value, gradient = zernike_sum(deformation.terms, deformation.coefficients_mm, x, y)
+    return value, gradient / deformation.radius_mm

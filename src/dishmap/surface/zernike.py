@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -64,10 +64,42 @@ def zernike_terms(max_degree: int) -> tuple[tuple[int, int], ...]:
 
 
 def zernike_matrix(terms: Sequence[tuple[int, int]], x: ArrayLike, y: ArrayLike) -> Array:
-    """Values (N, T) of terms (n, m) at points (N,) in units of the radius: the design matrix of a fit."""
-    if not len(terms):
-        return np.zeros((np.size(x), 0))
-    return np.stack([zernike_xy(n, m, x, y) for n, m in terms], axis=-1)
+    """Values (..., T) of terms (n, m) at points (...,) in units of the radius: the design matrix of a fit."""
+    out = np.zeros((np.size(x), len(terms)))
+    for order, members, z, t in _orders(terms, x, y):
+        power = z**order
+        for k, radial in enumerate(_jacobi(order, max(members), t)):
+            for column, m in members.get(k, ()):
+                out[:, column] = radial * _part(power, m)
+    return out.reshape(*np.shape(x), len(terms))
+
+
+def zernike_sum(terms: Sequence[tuple[int, int]], coefficients: ArrayLike, x: ArrayLike, y: ArrayLike) -> tuple[Array, Array]:
+    """Sum (N,) of terms (T) times coefficients (T,) at points (N,) in units of the radius, and its gradient (N, 2) per radius."""
+    factor = np.asarray(coefficients, dtype=float)
+    value, gradient = np.zeros(np.size(x)), np.zeros((np.size(x), 2))
+    for order, members, z, t in _orders(terms, x, y):
+        # a cos(m theta) + b sin(m theta) = Re (a - j b) exp(j m theta)
+        both = [sum((factor[i] if m >= 0 else -1j * factor[i]) for i, m in members.get(k, ())) for k in range(max(members) + 1)]
+        total, slope = np.zeros(len(t), complex), np.zeros(len(t), complex)
+        before, now, by_before, by_now = np.zeros_like(t), np.ones_like(t), np.zeros_like(t), np.zeros_like(t)
+        for k, weight in enumerate(both):
+            total += weight * now
+            slope += weight * by_now
+            rise, shift, back = _recurrence(order, k)
+            before, now, by_before, by_now = (
+                now,
+                (rise * t + shift) * now - back * before,
+                by_now,
+                (rise * t + shift) * by_now + rise * now - back * by_before,
+            )
+        power = z**order
+        turn = order * z ** (order - 1) * total if order else 0.0
+        # t = 2 rho^2 - 1
+        outward = 4 * (power * slope).real
+        value += (power * total).real
+        gradient += np.stack([outward * z.real + np.real(turn), outward * z.imag + np.real(1j * turn)], axis=1)
+    return value, gradient
 
 
 def term_name(n: int, m: int) -> str:
@@ -101,6 +133,41 @@ def parse_term(name: str) -> tuple[int, int]:
             return _BY_NAME[candidate]
     near = difflib.get_close_matches(text, _BY_NAME, n=1, cutoff=0.0)
     raise InputError(f"unknown Zernike term {name!r}; the nearest name is {near[0]!r}, and numbers as '2,-2' (n, m) are understood too")
+
+
+def _orders(
+    terms: Sequence[tuple[int, int]], x: ArrayLike, y: ArrayLike
+) -> Iterator[tuple[int, dict[int, list[tuple[int, int]]], NDArray[np.complex128], Array]]:
+    """Terms by their |m|: it, k = (n - |m|) / 2 -> (place, m) of the terms, the points as complex numbers, and t = 2 rho^2 - 1."""
+    z = np.ravel(np.asarray(x, dtype=float)) + 1j * np.ravel(np.asarray(y, dtype=float))
+    t = 2 * (z.real**2 + z.imag**2) - 1
+    orders: dict[int, dict[int, list[tuple[int, int]]]] = {}
+    for place, (n, m) in enumerate(terms):
+        _check(n, m)
+        orders.setdefault(abs(m), {}).setdefault((n - abs(m)) // 2, []).append((place, m))
+    for order, members in orders.items():
+        yield order, members, z, t
+
+
+def _jacobi(order: int, last: int, t: Array) -> Iterator[Array]:
+    """Jacobi polynomials P_k^(0,m)(t) for k = 0 to `last`."""
+    before, now = np.zeros_like(t), np.ones_like(t)
+    for k in range(last + 1):
+        yield now
+        rise, shift, back = _recurrence(order, k)
+        before, now = now, (rise * t + shift) * now - back * before
+
+
+def _recurrence(m: int, k: int) -> tuple[float, float, float]:
+    """P_(k+1) = (a t + b) P_k - c P_(k-1) for P^(0,m) (Abramowitz and Stegun 22.7.1)."""
+    if k == 0:
+        return (m + 2) / 2, -m / 2, 0.0
+    both = 2 * (k + 1) * (k + m + 1) * (2 * k + m)
+    return (
+        (2 * k + m) * (2 * k + m + 1) * (2 * k + m + 2) / both,
+        -(m**2) * (2 * k + m + 1) / both,
+        2 * k * (k + m) * (2 * k + m + 2) / both,
+    )
 
 
 def _prepare(n: int, m: int, x: ArrayLike, y: ArrayLike) -> tuple[NDArray[np.complex128], Array, int, int]:
