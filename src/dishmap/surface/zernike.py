@@ -80,7 +80,10 @@ def zernike_sum(terms: Sequence[tuple[int, int]], coefficients: ArrayLike, x: Ar
     value, gradient = np.zeros(np.size(x)), np.zeros((np.size(x), 2))
     for order, members, z, t in _orders(terms, x, y):
         # a cos(m theta) + b sin(m theta) = Re (a - j b) exp(j m theta)
-        both = [sum((factor[i] if m >= 0 else -1j * factor[i]) for i, m in members.get(k, ())) for k in range(max(members) + 1)]
+        both = np.zeros(max(members) + 1, complex)
+        for k, places in members.items():
+            for place, m in places:
+                both[k] += factor[place] if m >= 0 else -1j * factor[place]
         total, slope = np.zeros(len(t), complex), np.zeros(len(t), complex)
         before, now, by_before, by_now = np.zeros_like(t), np.ones_like(t), np.zeros_like(t), np.zeros_like(t)
         for k, weight in enumerate(both):
