@@ -97,11 +97,11 @@ def zernike_sum(terms: Sequence[tuple[int, int]], coefficients: ArrayLike, x: Ar
                 (rise * t + shift) * by_now + rise * now - back * by_before,
             )
         power = z**order
-        turn = order * z ** (order - 1) * total if order else 0.0
+        turn = order * z ** max(order - 1, 0) * total
         # t = 2 rho^2 - 1
         outward = 4 * (power * slope).real
         value += (power * total).real
-        gradient += np.stack([outward * z.real + np.real(turn), outward * z.imag + np.real(1j * turn)], axis=1)
+        gradient += np.stack([outward * z.real + turn.real, outward * z.imag - turn.imag], axis=1)
     return value, gradient
 
 
