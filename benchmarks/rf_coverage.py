@@ -131,6 +131,8 @@ def main() -> None:
     header = ("of", "figures", "rms error", "rms sigma", "median z", "rms z", "in 95 %", "+-")
     kinds = [*dict.fromkeys(t.figure for t in every)]
     print_table(header, [(name, *row([t for t in every if t.figure == name])) for name in kinds], "Each figure, both frequencies")
+    moved = [t for t in every if t.family != "none"]
+    print_table(header, [(name, *row([t for t in moved if t.figure == name])) for name in kinds], "Of dishes that moved")
     gains = [t for t in every if t.figure == "gain_dbi"]
     for what in ("frequency_ghz", "family", "camera"):
         groups = [*dict.fromkeys(getattr(t, what) for t in gains)]
