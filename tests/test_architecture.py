@@ -77,7 +77,7 @@ ORDER = [
     # from surface to signal
     *("rf.antenna", "rf.pattern", "rf.deformation"),
     *("rf.smooth_terms", "rf.smooth_fit", "rf.shape_field", "rf.shape_sources"),
-    *("rf.aperture", "rf.feed", "rf.correction", "rf.subreflector", "rf.rays", "rf.sources", "rf.farfield"),
+    *("rf.feed", "rf.correction", "rf.subreflector", "rf.aperture", "rf.rays", "rf.sources", "rf.farfield"),
     *("rf.beam", "rf.gain", "rf.best_fit", "rf.spread", "rf.state"),
     # and how the subreflector wins gain back
     *("rf.surrogate", "rf.limits", "rf.climb", "rf.starts", "rf.correct", "rf.modes", "rf.margin"),

@@ -12,13 +12,15 @@ from dishmap.rf.antenna import Antenna, Blockage, Feed, Reflector, Subreflector
 from dishmap.rf.correction import Correction, no_correction
 from dishmap.rf.deformation import Deformation
 from dishmap.rf.farfield import far_field
-from dishmap.rf.sources import sampled, sources, wavelength_of
+from dishmap.rf.sources import sampled, search_nodes, sources, wavelength_of
 from dishmap.surface.zernike import zernike_terms
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 GAIN_DB, PATTERN_DB, FLOOR_DB = 1e-4, 0.1, -40.0
+# a search needs to tell summits apart by thousandths of a dB
+SEARCH_DB = 2e-4
 
 DISH, OFFSET = Reflector(600, 300), Reflector(600, 300, 350.0)
 FEED = Feed("gaussian", 12.0)
@@ -65,6 +67,30 @@ def test_twice_as_many_nodes_change_nothing(case: str, monkeypatch: pytest.Monke
     assert abs(20 * np.log10(np.abs(plain).max() / peak)) < GAIN_DB
     seen = np.abs(twice) > peak * 10 ** (FLOOR_DB / 20)
     assert np.abs(20 * np.log10(np.abs(plain[seen]) / np.abs(twice[seen]))).max() < PATTERN_DB
+
+
+@pytest.mark.parametrize("case", ["perfect", "random", "spokes", "shadow_struts", "offset", "cut_shadow"])
+def test_a_search_on_fewer_nodes_sees_the_same_gain(case: str) -> None:
+    whole, terms, frequency, _ = CASES[case]
+    wavelength = wavelength_of(whole, frequency)
+    d = Deformation(tuple(terms), np.array(list(terms.values())), whole.reflector.center_mm, 300.0)
+    few, many = search_nodes(whole, d, wavelength), sampled(whole, d, wavelength, 0.02)
+    assert few.lit < 0.6 * many.lit
+    u = np.array([0.0, 0.008, 0.0])
+    fields = [far_field(sources(whole, d, no_correction(whole), nodes), wavelength, u, u[::-1], "x")[0] for nodes in (few, many)]
+    gains = [20 * np.log10(np.abs(one)) for one in fields]
+    assert np.abs(gains[0] - gains[1])[gains[1] > gains[1].max() - 10].max() < SEARCH_DB
+
+
+def test_a_subreflector_that_is_too_small_has_no_hard_edge() -> None:
+    whole = Antenna(DISH, FEED, Subreflector("cassegrain", 220.0, 4.0, 80.0), Blockage(0.0))
+    d, wavelength = Deformation((), np.zeros(0), np.zeros(2), 300.0), 10.0
+    for shift in (0.0, 1.0, 2.0):
+        moved = Correction(np.array([shift, 0.0, -shift]), np.zeros(2), np.zeros(0))
+        gains = [
+            far_field(sources(whole, d, moved, n(whole, d, wavelength)), wavelength, [0.0], [0.0], "x")[0] for n in (search_nodes, sampled)
+        ]
+        assert abs(20 * np.log10(np.abs(gains[0] / gains[1]))[0]) < SEARCH_DB
 
 
 def test_nodes_that_ignore_how_steep_the_shape_is_would_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,7 +13,7 @@ from numpy.typing import NDArray
 from dishmap.errors import InputError
 from dishmap.rf.antenna import Actuators, Antenna, Feed, Reflector, Subreflector, sub_vertex_z_mm
 from dishmap.rf.correction import Correction, no_correction, shape_terms
-from dishmap.rf.subreflector import nominal_reflection, patch, rim_disc, shape_heights, sub_surface
+from dishmap.rf.subreflector import lit_disc, nominal_reflection, patch, rim_disc, shape_heights, sub_surface
 
 Array = NDArray[np.float64]
 
@@ -136,3 +138,20 @@ def test_no_hyperboloid_reaches_the_rim_of_a_very_deep_dish() -> None:
         Antenna(Reflector(600, 100), Feed("gaussian", 12.0), Subreflector("cassegrain", 50, 1.4))
     with pytest.raises(InputError, match=r"behind the vertex of the dish"):
         Antenna(Reflector(600, 300), Feed("gaussian", 12.0), Subreflector("cassegrain", 3000, 8))
+
+
+@pytest.mark.parametrize(("kind", "offset"), [("cassegrain", 0.0), ("gregorian", 0.0), ("cassegrain", 340.0), ("gregorian", 340.0)])
+def test_a_rim_smaller_than_needed_lights_a_smaller_disc(kind: str, offset: float) -> None:
+    whole = antenna(kind, offset_mm=offset)
+    assert whole.subreflector is not None
+    center, needed = rim_disc(whole.reflector, whole.subreflector)
+    for share in (1.0, 1.2):
+        middle, radius = lit_disc(replace(whole, subreflector=replace(whole.subreflector, diameter_mm=2 * share * needed)))
+        assert (middle[0], middle[1], radius) == (offset, 0.0, 300.0)
+    small = replace(whole, subreflector=replace(whole.subreflector, diameter_mm=1.6 * needed))
+    middle, radius = lit_disc(small)
+    assert radius < 270
+    # rays to the edges of the disc in the plane of symmetry meet the subreflector at its rim
+    x = middle[0] + np.array([-radius, radius])
+    at = nominal_reflection(whole.reflector, whole.subreflector, np.stack([x, 0 * x, x**2 / 1200], axis=1))
+    assert np.sort(at[:, 0]) == pytest.approx([center - 0.8 * needed, center + 0.8 * needed], abs=1e-9)

@@ -17,6 +17,7 @@ from dishmap.surface.zernike import (
     zernike,
     zernike_gradient,
     zernike_matrix,
+    zernike_monomials,
     zernike_sum,
     zernike_terms,
     zernike_xy,
@@ -179,3 +180,13 @@ def test_unknown_name_gives_the_nearest() -> None:
 def test_impossible_terms_are_refused(n: int, m: int) -> None:
     with pytest.raises(InputError, match=f"no Zernike term n={n}, m={m}"):
         zernike(n, m, 0.5, 0.0)
+
+
+def test_terms_as_polynomials_are_the_same_terms() -> None:
+    rng = np.random.default_rng(4)
+    x, y = rng.uniform(-0.8, 0.8, (2, 200))
+    terms = zernike_terms(12)
+    powers, matrix = zernike_monomials(terms)
+    values = (x[:, None] ** powers[:, 0] * y[:, None] ** powers[:, 1]) @ matrix
+    # coefficients of degree 12 reach 1e4, which takes four digits from the rounding
+    assert values == pytest.approx(zernike_matrix(terms, x, y), abs=1e4 * ROUNDING)

@@ -12,18 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.rf.antenna import Antenna, Blockage
+from dishmap.rf.subreflector import lit_disc
 
 Array = NDArray[np.float64]
 
 # Nodes across a strut and, for so many of the disc's rings, along it.
 ACROSS_STRUT = 4
+# Rings and spokes of a small shadow, spokes of one that the rim cuts.
+LEAST_SHADOW, CUT_SPOKES = (4, 12), 64
 
 
 @dataclass(frozen=True)
 class ApertureNodes:
     """Nodes of a quadrature over the aperture, in nominal x and y.
 
-    xy_mm (N, 2); weight_mm2 (N,): negative in shadows; lit: how many of them, the first ones, cover the aperture as if nothing stood in it.
+    xy_mm (N, 2); weight_mm2 (N,): negative in shadows; lit: how many of them, the first ones, cover the part of the aperture that the
+    subreflector lights, as if nothing stood in it.
     """
 
     xy_mm: Array
@@ -32,14 +36,14 @@ class ApertureNodes:
 
 
 def aperture_nodes(antenna: Antenna, rings: int, spokes: int, shadow_radius_mm: float, shadow_x_mm: float = 0.0) -> ApertureNodes:
-    """Nodes over the aperture of an antenna, less the shadows of a disc of this radius about (shadow_x_mm, 0) and of the struts."""
-    main, blockage = antenna.reflector, antenna.blockage
-    center, radius = main.center_mm, main.diameter_mm / 2
+    """Nodes over the lit disc of the aperture, less the shadows of a disc of this radius about (shadow_x_mm, 0) and of the struts."""
+    blockage = antenna.blockage
+    center, radius = lit_disc(antenna)
     shadow = np.array([shadow_x_mm, 0.0])
     parts = [_disc(center, radius, rings, spokes)]
     lit = rings * spokes
     if shadow_radius_mm > 0:
-        xy, weight = _shadow(center, radius, shadow, shadow_radius_mm, rings, spokes)
+        xy, weight = _shadow(center, radius, shadow, shadow_radius_mm, *_fewer(center, radius, shadow, shadow_radius_mm, rings, spokes))
         parts.append((xy, -weight))
     for k in range(blockage.struts):
         angle = np.radians(blockage.strut_angle_deg) + 2 * np.pi * k / blockage.struts
@@ -56,6 +60,14 @@ def _disc(center: Array, radius: float, rings: int, spokes: int) -> tuple[Array,
     xy = center + rho[0][:, None, None] * np.stack([np.cos(phi), np.sin(phi)], axis=-1)
     weight = np.repeat(rho[0] * step[0], spokes) * (2 * np.pi / spokes)
     return xy.reshape(-1, 2), weight
+
+
+def _fewer(center: Array, radius: float, shadow: Array, shadow_radius: float, rings: int, spokes: int) -> tuple[int, int]:
+    """Rings and spokes for a shadow: phases vary over it as its size; one that the rim cuts has spokes whose length has a kink."""
+    if np.linalg.norm(shadow - center) + shadow_radius > radius:
+        return rings, max(spokes, CUT_SPOKES)
+    share = shadow_radius / radius
+    return min(rings, LEAST_SHADOW[0] + int(np.ceil(share * rings))), min(spokes, LEAST_SHADOW[1] + int(np.ceil(share * spokes)))
 
 
 def _shadow(center: Array, radius: float, shadow: Array, shadow_radius: float, rings: int, spokes: int) -> tuple[Array, Array]:

@@ -23,7 +23,7 @@ from dishmap.rf.deformation import Deformation
 from dishmap.rf.farfield import far_field
 from dishmap.rf.limits import Limits, limits_of, reached, value_names, within
 from dishmap.rf.pattern import decibels
-from dishmap.rf.sources import Sources, illuminated, sampled, sources, wavelength_of
+from dishmap.rf.sources import Sources, illuminated, sampled, search_nodes, sources, wavelength_of
 from dishmap.rf.starts import Start, least_squares, starts_around
 from dishmap.rf.surrogate import Tracer, co_moment, gain_dbi, linear_tracer, tracer
 
@@ -87,7 +87,7 @@ def best_correction(
         raise InputError("a correction needs at least one frequency in GHz")
     wavelengths = np.array([wavelength_of(antenna, f) for f in frequencies_ghz])
     aim = aim_of(wavelengths, antenna.reflector.diameter_mm, pointing == "free")
-    trace = tracer(antenna, illuminated(antenna, deformation, sampled(antenna, deformation, float(wavelengths.min()))))
+    trace = tracer(antenna, illuminated(antenna, deformation, search_nodes(antenna, deformation, float(wavelengths.min()))))
     before, before_uv = judged(antenna, deformation, no_correction(antenna), wavelengths, aim.free)
     summit, ends = _highest(trace, aim, limits_of(antenna.actuators, shape), progress)
     if len(summit.values) > len(RIGID):

@@ -8,6 +8,7 @@ anything that moves the subreflector is that of the path at a fixed point of it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +17,15 @@ from dishmap.errors import InputError
 from dishmap.rf.antenna import Antenna
 from dishmap.rf.correction import Correction
 from dishmap.rf.feed import FeedField, feed_field, radiated
-from dishmap.rf.subreflector import Patch, SubSurface, beyond_rim, local_xy, nominal_reflection, patch, shape_heights, sub_surface
+from dishmap.rf.subreflector import Patch, SubSurface, local_xy, nominal_reflection, patch, shape_heights, sub_surface
 from dishmap.transforms import right_jacobian, rotation_from_vector
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-# Newton's method for the point of reflection: steps, and when it stands still, in mm.
-STEPS, STILL_MM = 30, 1e-9
+# Newton's method for the point of reflection: steps, when a step is the last one, in mm (the next would be the square of it, over the size
+# of the subreflector), and above which last step there is no such point.
+STEPS, STILL_MM, FOUND_MM = 30, 1e-5, 1e-4
 LONGEST_STEP = 0.3
 
 
@@ -105,13 +107,13 @@ def _reflected(antenna: Antenna, surface: SubSurface, feed: FeedPlace, points: A
     a, b, d1, d2 = _ways(here.point_mm, feed.center_mm, points)
     hessian = _hessian(here, a, b, d1, d2)
     # off the nominal subreflector a path is shortest or longest; one that is neither has passed a caustic, and is one of several
-    lost = ~found | beyond_rim(surface, xy) | (np.linalg.det(hessian) <= 0)
+    lost = ~found | (_det(hessian) <= 0)
     _check_clear(antenna, feed, here.point_mm[~lost])
-    normal = np.cross(here.first[:, :, 0], here.first[:, :, 1])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = _cross(here.first[:, :, 0], here.first[:, :, 1])
+    amplitude = np.sqrt(_concentration(normal, hessian, a, b, d1, d2))
+    normal /= np.sqrt(_dot(normal, normal))[:, None]
     sent = radiated(feed.field, a @ feed.rotation) @ feed.rotation.T
-    field = 2 * (normal * sent).sum(axis=1, keepdims=True) * normal - sent
-    field = field * np.sqrt(_concentration(here, hessian, a, b, d1, d2))[:, None]
+    field = (2 * _dot(normal, sent)[:, None] * normal - sent) * amplitude[:, None]
     field[lost] = 0.0
     return Rays(d1 + d2, b, field, _by_values(surface, here, xy, a - b, correction), lost, here.point_mm)
 
@@ -125,16 +127,16 @@ def _stationary(surface: SubSurface, start: Array, points: Array, xy: Array) -> 
         gap = a - b
         gradient = np.stack([_dot(here.first[:, :, 0], gap), _dot(here.first[:, :, 1], gap)], axis=1)
         step = -_solve(_hessian(here, a, b, d1, d2), gradient[..., None])[..., 0]
-        long = np.linalg.norm(step, axis=1, keepdims=True)
-        xy = xy + step * np.minimum(1.0, reach / np.maximum(long, 1e-300))
+        long = np.sqrt(step[:, 0] ** 2 + step[:, 1] ** 2)
+        xy = xy + step * np.minimum(1.0, reach / np.maximum(long, 1e-300))[:, None]
         if (long < STILL_MM).all():
             break
-    return xy, np.asarray(long[:, 0] < 1e3 * STILL_MM), patch(surface, xy)
+    return xy, np.asarray(long < FOUND_MM), patch(surface, xy)
 
 
 def _ways(q: Array, start: Array, points: Array) -> tuple[Array, Array, Array, Array]:
     up, down = q - start, points - q
-    d1, d2 = np.linalg.norm(up, axis=1), np.linalg.norm(down, axis=1)
+    d1, d2 = np.sqrt(_dot(up, up)), np.sqrt(_dot(down, down))
     return up / d1[:, None], down / d2[:, None], d1, d2
 
 
@@ -151,23 +153,29 @@ def _hessian(here: Patch, a: Array, b: Array, d1: Array, d2: Array) -> Array:
     return out
 
 
-def _dot(p: Array, q: Array) -> Array:
+def _dot(p: Any, q: Any) -> Any:
     """Products (N,) of vectors (N, 3)."""
-    return np.asarray(p[:, 0] * q[:, 0] + p[:, 1] * q[:, 1] + p[:, 2] * q[:, 2])
+    return p[:, 0] * q[:, 0] + p[:, 1] * q[:, 1] + p[:, 2] * q[:, 2]
 
 
-def _concentration(here: Patch, hessian: Array, a: Array, b: Array, d1: Array, d2: Array) -> Array:
+def _cross(p: Array, q: Array) -> Array:
+    """Vector products (N, 3): numpy's own are slow."""
+    (a, b, c), (d, e, f) = p.T, q.T
+    return np.stack([b * f - c * e, c * d - a * f, a * e - b * d], axis=1)
+
+
+def _concentration(normal: Array, hessian: Array, a: Array, b: Array, d1: Array, d2: Array) -> Array:
     """Solid angle (N,) at the feed for each area across the arriving ray: how much power arrives there, in 1/mm^2.
 
-    A step e across the ray at the dish moves the point of reflection by H^-1 Q' e / d2, by the implicit function theorem.
+    A step e across the ray at the dish moves the point of reflection by H^-1 Q' e / d2, by the implicit function theorem, and the departing
+    ray by Q of that over d1; areas follow by determinants. normal (N, 3): product of the columns of Q.
     """
-    e1 = np.cross(b, np.where(np.abs(b[:, :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]))
-    e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
-    across = np.stack([e1, np.cross(b, e1)], axis=2)
-    right = np.swapaxes(here.first, 1, 2) @ across / d2[:, None, None]
-    moved = here.first @ _solve(hessian, right)
-    turned = (moved - a[:, :, None] * np.einsum("ni,nij->nj", a, moved)[:, None]) / d1[:, None, None]
-    return np.abs((a * np.cross(turned[:, :, 0], turned[:, :, 1])).sum(axis=1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.abs(_dot(a, normal) * _dot(b, normal) / _det(hessian)) / (d1 * d2) ** 2)
+
+
+def _det(matrix: Array) -> Array:
+    return np.asarray(matrix[:, 0, 0] * matrix[:, 1, 1] - matrix[:, 0, 1] * matrix[:, 1, 0])
 
 
 def _by_values(surface: SubSurface, here: Patch, xy: Array, gap: Array, correction: Correction) -> Array:
@@ -177,7 +185,7 @@ def _by_values(surface: SubSurface, here: Patch, xy: Array, gap: Array, correcti
     arm = here.point_mm - surface.vertex_mm
     # d(R p) = (J w) x (R p), J the left Jacobian: the right one of the opposite turn
     spin = right_jacobian([*-np.radians(correction.tilt_deg), 0.0])[:, :2] * np.radians(1.0)
-    out[:, 3:5] = np.cross(arm, gap) @ spin
+    out[:, 3:5] = _cross(arm, gap) @ spin
     if surface.terms:
         out[:, 5:] = (gap @ surface.rotation[:, 2])[:, None] * shape_heights(surface, xy)
     return out

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dishmap.rf.antenna import Antenna, Reflector, Subreflector, sub_vertex_z_mm
-from dishmap.rf.correction import Correction, shape_terms
-from dishmap.surface.zernike import zernike_gradient, zernike_matrix
+from dishmap.rf.correction import Correction, no_correction, shape_terms
+from dishmap.surface.zernike import zernike_monomials
 from dishmap.transforms import rotation_from_vector
 
 Array = NDArray[np.float64]
-
-# Step of the second derivatives of Zernike terms, from their gradients, in radii.
-STEP = 1e-4
 
 
 @dataclass(frozen=True)
 class SubSurface:
     """A subreflector in place: vertex (3,) and rotation (3, 3) after the correction, a and b of the conic, its rim, and its shape.
 
-    The rim is a disc in its own x and y, of `radius_mm` about (center_mm, 0); `limited`: whether rays beyond it are lost (a subreflector
-    whose diameter is not given is as large as it has to be).
+    The rim is a disc in its own x and y, of `radius_mm` about (center_mm, 0). The surface goes on beyond it: which part of the dish gets
+    light is settled by `lit_disc`.
     """
 
     subreflector: Subreflector
@@ -33,7 +30,6 @@ class SubSurface:
     b_mm: float
     center_mm: float
     radius_mm: float
-    limited: bool
     terms: tuple[tuple[int, int], ...]
     shape_mm: Array
 
@@ -67,7 +63,6 @@ def sub_surface(antenna: Antenna, correction: Correction) -> SubSurface:
         b_mm=float(np.sqrt(abs(c**2 - a**2))),
         center_mm=center,
         radius_mm=radius,
-        limited=sub.diameter_mm is not None,
         terms=shape_terms(antenna.actuators),
         shape_mm=correction.shape_mm,
     )
@@ -103,53 +98,81 @@ def local_xy(surface: SubSurface, points_mm: Array) -> Array:
 def patch(surface: SubSurface, xy_mm: Array) -> Patch:
     """Points and derivatives at the subreflector's own x, y (N, 2)."""
     height, slope, bend = _conic(surface, xy_mm)
-    if surface.terms and surface.shape_mm.any():
+    if surface.shape_mm.any():
         for own, extra in zip((height, slope, bend), _shape(surface, xy_mm), strict=True):
             own += extra
     local = np.concatenate([xy_mm, height[:, None]], axis=1)
     turn = surface.rotation
-    first = turn[None, :, :2] + turn[None, :, 2:] * slope[:, None, :]
+    first = np.empty((len(xy_mm), 3, 2))
+    for k in range(2):
+        first[:, :, k] = turn[:, k] + slope[:, k, None] * turn[:, 2]
     return Patch(surface.vertex_mm + local @ turn.T, first, bend, turn[:, 2])
 
 
 def shape_heights(surface: SubSurface, xy_mm: Array) -> Array:
     """Heights (N, T) of unit shape terms at own x, y (N, 2), along the subreflector's axis."""
-    return zernike_matrix(surface.terms, *_disc_xy(surface, xy_mm))
+    powers, matrix = zernike_monomials(surface.terms)
+    x, y = _powers(*_disc_xy(surface, xy_mm), int(powers.max(initial=0)))
+    return np.asarray((x[:, powers[:, 0]] * y[:, powers[:, 1]]) @ matrix)
 
 
-def beyond_rim(surface: SubSurface, xy_mm: Array) -> NDArray[np.bool_]:
-    """Where rays (N,) pass the subreflector."""
-    x, y = _disc_xy(surface, xy_mm)
-    return np.asarray(x**2 + y**2 > 1.0) if surface.limited else np.zeros(len(xy_mm), bool)
+def lit_disc(antenna: Antenna) -> tuple[Array, float]:
+    """Centre (2,) and radius of the disc of the aperture that the subreflector lights in its nominal place: all of it, or less.
+
+    A rim given smaller than the rays to the dish need is carried to the aperture by its two rays in the plane of symmetry, and taken to
+    light a disc (a plane rim does). The edge stays there while the subreflector moves, so that gain is smooth: what such a rim lets past
+    on one side it takes on the other. Against an edge that moves along this leaves out 0.03 dB for 2 mm along z (0.6 m, 30 GHz, 80 mm
+    for 94), and up to 0.15 dB for 2 mm aside and 1 degree where the rim is just as large as needed, which has nothing to spare on the
+    other side. Diffraction at the edge is left out too.
+    """
+    main, sub = antenna.reflector, antenna.subreflector
+    if sub is None or sub.diameter_mm is None or sub.diameter_mm >= 2 * rim_disc(main, replace(sub, diameter_mm=None))[1]:
+        return main.center_mm, main.diameter_mm / 2
+    surface = sub_surface(antenna, no_correction(antenna))
+    edges = np.array([[surface.center_mm - surface.radius_mm, 0.0], [surface.center_mm + surface.radius_mm, 0.0]])
+    way = patch(surface, edges).point_mm - main.focus_mm
+    way *= (1.0 if sub.kind == "cassegrain" else -1.0) / np.linalg.norm(way, axis=1, keepdims=True)
+    # a ray from the focus meets the paraboloid at the distance 2 f / (1 - cos)
+    x = 2 * main.focal_length_mm * way[:, 0] / (1 - way[:, 2])
+    return np.array([x.mean(), 0.0]), float(np.ptp(x)) / 2
 
 
 def _conic(surface: SubSurface, xy: Array) -> tuple[Array, Array, Array]:
     """Height above the vertex, slope (N, 2), second derivatives (N, 2, 2): z = a sqrt(1 +- r^2 / b^2) - a."""
     sign = 1.0 if surface.subreflector.kind == "cassegrain" else -1.0
     a, b = surface.a_mm, surface.b_mm
-    root = np.sqrt(np.maximum(1 + sign * (xy**2).sum(axis=1) / b**2, 1e-12))
-    slope = sign * a / b**2 * xy / root[:, None]
-    bend = sign * a / b**2 / root[:, None, None] * np.eye(2) - a / b**4 / root[:, None, None] ** 3 * xy[:, :, None] * xy[:, None, :]
+    x, y = xy.T
+    square = x**2 + y**2
+    root = np.sqrt(np.maximum(1 + sign * square / b**2, 1e-12))
+    steep = sign * a / b**2 / root
+    less = a / b**4 / root**3
+    bend = np.empty((len(xy), 2, 2))
+    bend[:, 0, 0], bend[:, 1, 1] = steep - less * x**2, steep - less * y**2
+    bend[:, 0, 1] = bend[:, 1, 0] = -less * x * y
     # height without taking the difference of two large numbers
-    return sign * a * (xy**2).sum(axis=1) / b**2 / (root + 1), slope, bend
+    return sign * a * square / b**2 / (root + 1), steep[:, None] * xy, bend
 
 
 def _shape(surface: SubSurface, xy: Array) -> tuple[Array, Array, Array]:
-    x, y = _disc_xy(surface, xy)
-    height = zernike_matrix(surface.terms, x, y) @ surface.shape_mm
-    slope, bend = np.zeros((len(xy), 2)), np.zeros((len(xy), 2, 2))
+    powers, matrix = zernike_monomials(surface.terms)
+    p, q = powers.T
+    x, y = _powers(*_disc_xy(surface, xy), int(powers.max()))
+    weight, r = matrix @ surface.shape_mm, surface.radius_mm
 
-    def gradient(px: Array, py: Array) -> Array:
-        total = np.zeros((len(px), 2))
-        for (n, m), value in zip(surface.terms, surface.shape_mm, strict=True):
-            if value:
-                total += value * np.stack(zernike_gradient(n, m, px, py), axis=1)
-        return total
+    def total(factor: NDArray[np.int64], less_x: int, less_y: int) -> Array:
+        return np.asarray((x[:, np.maximum(p - less_x, 0)] * y[:, np.maximum(q - less_y, 0)]) @ (factor * weight))
 
-    slope = gradient(x, y) / surface.radius_mm
-    for k, (dx, dy) in enumerate(((STEP, 0.0), (0.0, STEP))):
-        bend[:, :, k] = (gradient(x + dx, y + dy) - gradient(x - dx, y - dy)) / (2 * STEP * surface.radius_mm**2)
-    return height, slope, (bend + np.swapaxes(bend, 1, 2)) / 2
+    one = np.ones_like(p)
+    slope, bend = np.empty((len(xy), 2)), np.empty((len(xy), 2, 2))
+    slope[:, 0], slope[:, 1] = total(p, 1, 0) / r, total(q, 0, 1) / r
+    bend[:, 0, 0], bend[:, 1, 1] = total(p * (p - 1), 2, 0) / r**2, total(q * (q - 1), 0, 2) / r**2
+    bend[:, 0, 1] = bend[:, 1, 0] = total(p * q, 1, 1) / r**2
+    return total(one, 0, 0), slope, bend
+
+
+def _powers(x: Array, y: Array, degree: int) -> tuple[Array, Array]:
+    """Powers 0 to degree (N, degree + 1) of x and y."""
+    return np.vander(x, degree + 1, increasing=True), np.vander(y, degree + 1, increasing=True)
 
 
 def _disc_xy(surface: SubSurface, xy: Array) -> tuple[Array, Array]:

@@ -24,7 +24,7 @@ from dishmap.rf.feed import ludwig_axes, polarization_axes
 from dishmap.rf.goals import Broaden, Goal, Mask, cost, directions, figure
 from dishmap.rf.limits import Limits, best_step, limits_of, reached, value_names, whole, within
 from dishmap.rf.pattern import decibels
-from dishmap.rf.sources import illuminated, sampled, wavelength_of
+from dishmap.rf.sources import illuminated, search_nodes, wavelength_of
 from dishmap.rf.starts import Start, away, least_squares
 from dishmap.rf.surrogate import DB, Traced, Tracer, linear_tracer, tracer
 
@@ -81,7 +81,7 @@ def target_beam(
     aim = aim_of(np.array([wavelength]), antenna.reflector.diameter_mm, False)
     uv = directions(goal, aim.reach)
     limits = limits_of(antenna.actuators, shape)
-    nodes = sampled(antenna, deformation, wavelength, np.sqrt(2) * aim.reach)
+    nodes = search_nodes(antenna, deformation, wavelength, float(np.hypot(*uv.T).max()))
     values, settled, count = _nearest(tracer(antenna, illuminated(antenna, deformation, nodes)), aim, limits, goal, uv, progress)
     correction = correction_of(within(antenna.actuators, whole(limits, values)))
     before = _gains(antenna, deformation, no_correction(antenna), wavelength, uv)

@@ -10,6 +10,8 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterator, Sequence
+from functools import cache
+from math import comb, factorial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -103,6 +105,30 @@ def zernike_sum(terms: Sequence[tuple[int, int]], coefficients: ArrayLike, x: Ar
         value += (power * total).real
         gradient += np.stack([outward * z.real + turn.real, outward * z.imag - turn.imag], axis=1)
     return value, gradient
+
+
+@cache
+def zernike_monomials(terms: tuple[tuple[int, int], ...]) -> tuple[NDArray[np.int64], Array]:
+    """Terms (T) as polynomials: powers (K, 2) of x and y, in units of the radius, and coefficients (K, T).
+
+    Fast for many points and with all derivatives, but for low degrees only: from about the 20th on, large terms cancel.
+    """
+    degree = max((n for n, _ in terms), default=0)
+    powers = [(p, q) for p in range(degree + 1) for q in range(degree + 1 - p)]
+    place = {power: i for i, power in enumerate(powers)}
+    matrix = np.zeros((len(powers), len(terms)))
+    for column, (n, m) in enumerate(terms):
+        _check(n, m)
+        order, k = abs(m), (n - abs(m)) // 2
+        for s in range(k + 1):
+            radial = (-1) ** s * factorial(n - s) // (factorial(s) * factorial((n + order) // 2 - s) * factorial(k - s))
+            for a in range(k - s + 1):
+                for b in range(order + 1):
+                    # (x^2 + y^2)^(k-s) (x + i y)^order, its real or imaginary part
+                    turn = 1j**b if m >= 0 else 1j ** (b + 3)
+                    power = (2 * (k - s - a) + order - b, 2 * a + b)
+                    matrix[place[power], column] += radial * comb(k - s, a) * comb(order, b) * turn.real
+    return np.array(powers), matrix
 
 
 def term_name(n: int, m: int) -> str:
