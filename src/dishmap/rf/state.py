@@ -88,7 +88,9 @@ def _reading(antenna: Antenna, deformation: Deformation, correction: Correction,
         coarse = sources(antenna, deformation, correction, sampled(antenna, deformation, wavelength))
         some = spread(coarse, deformation, drawn, beam, wavelength, diameter, wanted)
     side = np.linspace(-widest, widest, GRID_SIDE)
-    angles = np.degrees(np.arcsin(np.linspace(-widest, widest, CUT_COUNT)))
+    # cuts in equal steps of the angle, as files of cuts have them
+    reach = np.degrees(np.arcsin(widest))
+    angles = np.linspace(-reach, reach, CUT_COUNT)
     return Reading(
         frequency_ghz=frequency,
         wavelength_mm=wavelength,
