@@ -19,6 +19,7 @@ from dishmap.cli.diff import diff_command
 from dishmap.cli.map import map_command
 from dishmap.cli.pattern import pattern_group
 from dishmap.cli.plan import plan_group
+from dishmap.cli.rf import rf_command
 from dishmap.cli.sheet import sheet_group
 from dishmap.cli.simulate import simulate_command
 from dishmap.cli.undistort import undistort_command
@@ -82,6 +83,7 @@ for _command in (
     calibrate_command,
     map_command,
     diff_command,
+    rf_command,
     simulate_command,
     undistort_command,
     demo_command,

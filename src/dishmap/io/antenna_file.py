@@ -100,6 +100,12 @@ def read_antenna(path: str | os.PathLike[str]) -> Antenna:
     return parse_antenna(toml_text(path, "antenna file"), Path(path).parent, str(path))
 
 
+def feed_path(path: str | os.PathLike[str]) -> Path | None:
+    """The file of the feed that an antenna file names, or None. Raises InputError."""
+    model = checked(toml_content(toml_text(path, "antenna file"), str(path)), AntennaModel, str(path))
+    return None if model.feed.file is None else Path(path).parent / model.feed.file
+
+
 def parse_antenna(text: str, folder: str | os.PathLike[str] = ".", source: str = "the antenna") -> Antenna:
     """Make an Antenna of the text of an antenna file, whose feed's file is found in `folder`. Raises InputError."""
     model = checked(toml_content(text, source), AntennaModel, source)

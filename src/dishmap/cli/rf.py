@@ -1,0 +1,175 @@
+"""`dishmap rf`: what a measured shape costs in gain, and how the subreflector or the feed wins it back."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from dishmap.cli.options import PATH, Numbers, out_folder
+from dishmap.cli.terminal import progress, say, table
+from dishmap.errors import InputError
+
+if TYPE_CHECKING:
+    from dishmap.rf.analysis import RfAnalysis
+
+FREQUENCY = "--frequency-ghz"
+REPORT = "report.html"
+
+
+class SeveralNumbers(click.Command):
+    """A command whose option FREQUENCY takes all numbers that follow it."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Give each further number an option of its own."""
+        return super().parse_args(ctx, repeated(args))
+
+
+def repeated(args: list[str]) -> list[str]:
+    """Words in which FREQUENCY stands before every number that follows it: click's options take one word each."""
+    out: list[str] = []
+    taking = False
+    for place, word in enumerate(args):
+        if word == "--":
+            return [*out, *args[place:]]
+        first = bool(out) and out[-1] == FREQUENCY
+        if taking and not first and _is_number(word):
+            out.append(FREQUENCY)
+        taking = word == FREQUENCY or (taking and (first or _is_number(word)))
+        out.append(word)
+    return out
+
+
+def _is_number(word: str) -> bool:
+    try:
+        return bool([float(part) for part in word.split(",")])
+    except ValueError:
+        return False
+
+
+@click.command("rf", cls=SeveralNumbers)
+@click.argument("shape", type=PATH)
+@click.option("--antenna", "antenna_file", type=PATH, required=True, help="Antenna file (TOML).")
+@click.option(
+    FREQUENCY,
+    "frequencies",
+    type=Numbers(),
+    multiple=True,
+    required=True,
+    metavar="GHZ...",
+    help="One or more frequencies.",
+)
+@out_folder
+@click.option("--correct", is_flag=True, help="Find the pose (and shape, where it can change) of the subreflector or feed that wins most back.")
+@click.option(
+    "--pointing",
+    type=click.Choice(["free", "fixed"]),
+    default="free",
+    show_default=True,
+    help="Whether the antenna is pointed anew, so that gain counts at the beam's peak, or gain counts on the boresight.",
+)
+@click.option(
+    "--target-beam",
+    metavar="GOAL",
+    help="A beam to make with the same actuators: steer:THETA,PHI, broaden:RADIUS_DEG or mask:FILE.",
+)
+@click.option("--whole-motion", is_flag=True, help="Take the rigid motion of the dish as its own, not as the camera's.")
+@click.option("--camera", "camera_file", type=PATH, help="Camera file of a map.  [default: the one that its summary.json names]")
+@click.option("--pattern", "pattern_file", type=PATH, help="Pattern file of a map.  [default: the one that its summary.json names]")
+def rf_command(shape: Path, antenna_file: Path, out: Path, **given: Any) -> None:
+    """What the SHAPE of a dish costs in gain, and how the subreflector (or the feed at the prime focus) wins it back.
+
+    SHAPE is a folder that `dishmap diff` or `dishmap map` left, or its difference.npz, difference.csv or measurement.npz.
+    """
+    from dishmap.io.antenna_file import read_antenna
+    from dishmap.io.atomic import output_folder
+    from dishmap.io.camera_file import read_camera
+    from dishmap.io.pattern_file import read_pattern
+    from dishmap.io.shape_input import read_shape_field, shape_file
+    from dishmap.rf.analysis import RfOptions, analyse
+
+    begin = time.perf_counter()
+    antenna = read_antenna(antenna_file)
+    options = RfOptions(frequencies_of(given["frequencies"]), given["correct"], given["pointing"])
+    quantity = quantity_of(shape_file(shape), given["whole_motion"])
+    camera_file, pattern_file = given["camera_file"], given["pattern_file"]
+    camera = None if camera_file is None else read_camera(camera_file)
+    pattern = None if pattern_file is None else read_pattern(pattern_file)
+    field = read_shape_field(shape, antenna.reflector, "shape" if quantity == "surface" else quantity, camera, pattern)
+    read = time.perf_counter()
+    inputs = inputs_of(shape, antenna_file, camera_file, pattern_file)
+    with output_folder(out):
+        with progress("from shape to gain") as tell:
+            analysis = analyse(field, quantity, antenna, options, lambda what, done, total: tell(done, total))
+        leave(analysis, inputs, {"read": read - begin, "analyse": time.perf_counter() - read}, title_of(shape), out)
+    print_analysis(analysis, title_of(shape), out)
+
+
+def frequencies_of(given: tuple[list[float], ...]) -> tuple[float, ...]:
+    """All frequencies, as given. Raises InputError for one that is given twice."""
+    frequencies = tuple(frequency for some in given for frequency in some)
+    twice = next((f for f in frequencies if frequencies.count(f) > 1), None)
+    if twice is not None:
+        raise InputError(f"{FREQUENCY} names {twice:g} GHz twice; name each frequency once")
+    return frequencies
+
+
+def quantity_of(file: Path, whole_motion: bool) -> str:
+    """What the shape in a file is of. Raises InputError for the motion of a map, which has none."""
+    from dishmap.io.measurement_file import is_measurement
+
+    if is_measurement(file):
+        if whole_motion:
+            raise InputError(f"--whole-motion asks for the motion between two states, and {file} is a map of one; leave it out")
+        return "surface"
+    return "displacement" if whole_motion else "shape"
+
+
+def inputs_of(shape: Path, antenna_file: Path, camera_file: Path | None, pattern_file: Path | None) -> dict[str, Path]:
+    """What each input file is -> its path."""
+    from dishmap.io.antenna_file import feed_path
+    from dishmap.io.shape_input import shape_file
+
+    given = {
+        "shape": shape_file(shape),
+        "antenna": antenna_file,
+        "feed": feed_path(antenna_file),
+        "camera": camera_file,
+        "pattern": pattern_file,
+    }
+    return {what: path for what, path in given.items() if path is not None}
+
+
+def leave(analysis: RfAnalysis, inputs: dict[str, Path], seconds: dict[str, float], title: str, out: Path) -> None:
+    """Write all files of an analysis."""
+    from dishmap.io.rf_results import RfProvenance, rf_files, write_rf
+    from dishmap.rf_report import rf_report
+
+    files = rf_files(analysis, RfProvenance(inputs, seconds))
+    page = rf_report(analysis, title, {what: str(path) for what, path in inputs.items()})
+    write_rf(out, {**files, REPORT: page})
+
+
+def title_of(shape: Path) -> str:
+    """The heading of a report."""
+    return f"Gain with the shape of {shape}"
+
+
+def print_analysis(analysis: RfAnalysis, title: str, out: Path) -> None:
+    """Print what the shape costs and what wins it back."""
+    from dishmap.rf_tables import brief_rows, correction_rows
+    from dishmap.rf_verdict import rf_verdict
+
+    verdict = rf_verdict(analysis)
+    say(title)
+    say(f"  {verdict.headline}")
+    say(table(*brief_rows(analysis)))
+    for name in analysis.corrections:
+        heads, rows = correction_rows(analysis, name)
+        say(f"  {name}:")
+        say(table(heads, rows))
+    for warning in verdict.warnings:
+        say(f"  {warning.replace('`', '')}")
+    say(f"report: {out / REPORT}")

@@ -1,0 +1,157 @@
+"""What is said of an analysis of gain: its words hold its figures, and its page works offline for every kind of antenna."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from rf_analyses import OFFSET, PRIME, SHAPING, analysis_of, changed
+
+from dishmap.rf.analysis import Change, RfAnalysis
+from dishmap.rf.antenna import Antenna
+from dishmap.rf_assumptions import NOT_MODELLED, assumptions
+from dishmap.rf_report import rf_report
+from dishmap.rf_tables import beam_rows, best_fit_rows, brief_rows, budget_rows, correction_rows, gain_rows, mode_rows
+from dishmap.rf_verdict import gain_of, loss_of, rf_verdict
+
+
+class Tags(HTMLParser):
+    """All tags of a page with what they point to."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.links: list[str] = []
+        self.images = 0
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.images += tag == "img"
+        self.links += [value or "" for name, value in attrs if name in ("src", "href")]
+
+
+def tags_of(page: str) -> Tags:
+    tags = Tags()
+    tags.feed(page)
+    return tags
+
+
+def test_headline_says_what_it_costs_and_what_wins_it_back() -> None:
+    assert rf_verdict(analysis_of(PRIME)).headline == (
+        "At 20 GHz the change of shape costs 1.250 ± 0.030 dB; moving the feed wins back 0.750 ± 0.020 dB."
+    )
+    assert rf_verdict(analysis_of(SHAPING)).headline == (
+        "At 20 GHz the change of shape costs 1.250 ± 0.030 dB; moving the subreflector wins back 0.750 ± 0.020 dB; "
+        "bending it as well wins back 0.750 ± 0.020 dB."
+    )
+    assert rf_verdict(analysis_of(PRIME, correct=False)).headline == "At 20 GHz the change of shape costs 1.250 ± 0.030 dB."
+
+
+def test_headline_takes_the_highest_frequency() -> None:
+    two = changed(analysis_of(PRIME, (20.0, 15.0)), lost=(Change(-1.0, 0.1, -1.2, -0.8), Change(-0.5, 0.1, -0.7, -0.3)))
+    assert rf_verdict(two).headline.startswith("At 20 GHz the change of shape costs 1.00 ± 0.10 dB")
+
+
+def test_a_loss_within_its_sigma_is_none() -> None:
+    small = changed(analysis_of(PRIME, correct=False), lost=(Change(-0.01, 0.02, -0.05, 0.01),))
+    assert "nothing that the map can tell from zero: 0.010 ± 0.020 dB" in rf_verdict(small).headline
+
+
+def test_warnings() -> None:
+    plain = analysis_of(SHAPING)
+    found = plain.corrections["corrected"]
+    told = "\n".join(rf_verdict(plain).warnings)
+    assert "12 % of the aperture's field" in told
+    assert "the limit is reached of shift along z" in told
+    unsure = changed(
+        plain,
+        extrapolated_share=0.0,
+        quantity="surface",
+        corrections={"corrected": replace(found, limits=(), converged=False, improved=False)},
+        recovered={"corrected": plain.recovered["corrected"]},
+        field=replace(plain.field, left_out=(3, 7), own_mm=1.0),
+    )
+    told = "\n".join(rf_verdict(unsure).warnings)
+    assert "extrapolated" not in told
+    for words in ("one photograph", "did not come to rest", "stays where it is", "2 targets moved apart", "on their own by 1.00 mm"):
+        assert words in told
+    assert "wins nothing back" in rf_verdict(unsure).headline
+
+
+def test_wrapped_phases_and_broken_beams_are_told() -> None:
+    plain = analysis_of(PRIME, correct=False)
+    design, measured = plain.states
+    reading = measured.readings[0]
+    path = replace(reading.path, half_path_mm=20 * reading.path.half_path_mm)
+    lost = replace(reading, path=path, beam=replace(reading.beam, gain_dbi=reading.beam.gain_dbi - 20))
+    told = "\n".join(rf_verdict(changed(plain, states=(design, replace(measured, readings=(lost,))))).warnings)
+    assert "phases wrap" in told
+    assert "broken up" in told
+    assert "wrap" not in "\n".join(rf_verdict(plain).warnings)
+
+
+def test_fixed_pointing_counts_on_the_boresight() -> None:
+    plain = analysis_of(PRIME)
+    fixed = changed(plain, options=replace(plain.options, pointing="fixed"))
+    reading = plain.states[2].readings[0]
+    assert gain_of(plain, reading)[0] == reading.beam.gain_dbi
+    assert gain_of(fixed, reading)[0] == reading.beam.boresight_dbi < reading.beam.gain_dbi
+    assert loss_of(fixed, plain.states[2], 0)[0] > loss_of(plain, plain.states[2], 0)[0]
+    assert "boresight" in assumptions(fixed)[2]
+
+
+def test_tables_hold_every_state_and_frequency() -> None:
+    analysis = analysis_of(SHAPING, (15.0, 20.0))
+    for rows_of in (brief_rows, gain_rows, beam_rows, budget_rows):
+        heads, rows = rows_of(analysis)
+        assert [row[:2] for row in rows] == [[f, s] for f in ("15", "20") for s in ("design", "measured", "corrected", "shaped")]
+        assert {len(row) for row in rows} == {len(heads)}
+    gain = analysis.states[1].readings[1].beam.gain_dbi
+    assert gain_rows(analysis)[1][5][2].startswith(f"{gain:.1f}")
+    assert float(best_fit_rows(analysis)[1][5][2].split()[0]) == pytest.approx(analysis.best_fit.values[5], abs=0.01)
+    assert [row[0] for row in mode_rows(analysis, 0, 2)[1]] == ["defocus (2, 0)", "astigmatism cos (2, 2)"]
+
+
+def test_correction_table_says_which_limit_is_reached() -> None:
+    analysis = analysis_of(SHAPING)
+    rigid, shaped = (correction_rows(analysis, name)[1] for name in ("corrected", "shaped"))
+    assert [row[0] for row in rigid] == ["shift x", "shift y", "shift z", "tilt x", "tilt y"]
+    assert [row[4] for row in rigid] == ["", "", "at its limit", "", ""]
+    assert rigid[2][2:4] == ["+0.3000", "± 2"]
+    assert [row[0] for row in shaped[5:]] == ["shape, astigmatism sin (2, -2)", "shape, defocus (2, 0)", "shape, astigmatism cos (2, 2)", "shape, farthest point"]
+
+
+@pytest.mark.parametrize("antenna", [PRIME, SHAPING, OFFSET], ids=["prime", "shaping", "offset"])
+def test_page_needs_no_network_and_escapes(antenna: Antenna) -> None:
+    analysis = analysis_of(antenna)
+    page = rf_report(analysis, "Gain <b>&", {"shape": "<script>alert(1)</script>"})
+    tags = tags_of(page)
+    assert all(link.startswith("data:") for link in tags.links)
+    assert "<b>" not in page
+    assert "<script>alert" not in page
+    assert rf_verdict(analysis).headline in page
+    # gain curve, antenna, modes, margin, three maps of the surface, path errors; phase, cuts and pattern of the frequency
+    assert tags.images == 11
+    for words in NOT_MODELLED:
+        assert words.split(":")[0].replace("'", "&#x27;") in page
+    assert not re.search(r">nan<|\bnan\b ", page)
+
+
+def test_page_of_two_frequencies_without_a_correction() -> None:
+    analysis = analysis_of(PRIME, (15.0, 20.0), correct=False)
+    tags = tags_of(rf_report(analysis, "title", {}))
+    # no curve of the margin, but phase, cuts and pattern twice
+    assert tags.images == 13
+
+
+def test_page_of_a_perfect_dish() -> None:
+    plain = analysis_of(PRIME, correct=False)
+    still = replace(plain.states[1], deformation=replace(plain.states[1].deformation, coefficients_mm=np.zeros(4)))
+    flat = changed(plain, states=(plain.states[0], still), lost=(Change(0.0, 0.0, 0.0, 0.0),))
+    assert "costs 0 dB" in rf_report(flat, "title", {})
+
+
+def test_same_input_same_page() -> None:
+    analysis: RfAnalysis = analysis_of(PRIME, correct=False)
+    assert rf_report(analysis, "title", {}) == rf_report(analysis, "title", {})
