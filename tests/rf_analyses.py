@@ -57,6 +57,10 @@ def field_of(antenna: Antenna) -> ShapeField:
 @cache
 def analysis_of(antenna: Antenna, frequencies_ghz: tuple[float, ...] = (20.0,), correct: bool = True) -> RfAnalysis:
     """An analysis whose corrections were not sought but made up; everything else is as `analyse` makes it."""
+    if not correct:
+        whole = analysis_of(antenna, frequencies_ghz)
+        modes = {"measured": whole.modes["measured"]}
+        return replace(whole, states=whole.states[:2], modes=modes, corrections={}, recovered={}, margin=None)
     field, still = field_of(antenna), no_correction(antenna)
     shape, drawn = deformation_of(field), draws(field, np.random.default_rng(3), 20)
     states = [
@@ -65,7 +69,7 @@ def analysis_of(antenna: Antenna, frequencies_ghz: tuple[float, ...] = (20.0,), 
     ]
     values = still.values
     values[:5] = [0.1, -0.05, 0.3, 0.2, -0.1]
-    names = ["corrected", "shaped"][: 1 + bool(antenna.actuators.shape_degree)] if correct else []
+    names = ["corrected", "shaped"][: 1 + bool(antenna.actuators.shape_degree)]
     corrections = {}
     for name in names:
         moved = correction_of(values + 0.02 * (np.arange(len(values)) > 4) * (name == "shaped"))
@@ -78,14 +82,14 @@ def analysis_of(antenna: Antenna, frequencies_ghz: tuple[float, ...] = (20.0,), 
         antenna=antenna,
         field=field,
         quantity="shape",
-        options=RfOptions(frequencies_ghz, correct, draws=20),
+        options=RfOptions(frequencies_ghz, True, draws=20),
         best_fit=best_fit(antenna, shape, currents, field.factor_mm),
         states=tuple(states),
         modes={state.name: (rows,) * count for state in states[1:]},
         corrections=corrections,
         lost=(Change(-1.25, 0.03, -1.31, -1.19),) * count,
         recovered={name: (Change(0.75, 0.02, 0.71, 0.79),) * count for name in names},
-        margin=Margin(np.array([0.01, 0.1]), {name: np.array([0.001, 0.1]) for name in names}, SIGMA_MM) if names else None,
+        margin=Margin(np.array([0.01, 0.1]), {name: np.array([0.001, 0.1]) for name in names}, SIGMA_MM),
         target_beam=None,
         extrapolated_share=0.12,
     )

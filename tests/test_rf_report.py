@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
+from html import escape
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from rf_analyses import OFFSET, PRIME, SHAPING, analysis_of, changed
 
-from dishmap.rf.analysis import Change, RfAnalysis
-from dishmap.rf.antenna import Antenna
+from dishmap.rf.analysis import Change
 from dishmap.rf_assumptions import NOT_MODELLED, assumptions
 from dishmap.rf_report import rf_report
 from dishmap.rf_tables import beam_rows, best_fit_rows, brief_rows, budget_rows, correction_rows, gain_rows, mode_rows
@@ -49,7 +48,8 @@ def test_headline_says_what_it_costs_and_what_wins_it_back() -> None:
 
 
 def test_headline_takes_the_highest_frequency() -> None:
-    two = changed(analysis_of(PRIME, (20.0, 15.0)), lost=(Change(-1.0, 0.1, -1.2, -0.8), Change(-0.5, 0.1, -0.7, -0.3)))
+    plain = analysis_of(PRIME, correct=False)
+    two = changed(plain, options=replace(plain.options, frequencies_ghz=(20.0, 15.0)), lost=(Change(-1.0, 0.1, -1.2, -0.8), Change(-0.5, 0.1, -0.7, -0.3)))
     assert rf_verdict(two).headline.startswith("At 20 GHz the change of shape costs 1.00 ± 0.10 dB")
 
 
@@ -108,7 +108,7 @@ def test_tables_hold_every_state_and_frequency() -> None:
         assert [row[:2] for row in rows] == [[f, s] for f in ("15", "20") for s in ("design", "measured", "corrected", "shaped")]
         assert {len(row) for row in rows} == {len(heads)}
     gain = analysis.states[1].readings[1].beam.gain_dbi
-    assert gain_rows(analysis)[1][5][2].startswith(f"{gain:.1f}")
+    assert gain_rows(analysis)[1][5][2].startswith(f"{gain:.2f}")
     assert float(best_fit_rows(analysis)[1][5][2].split()[0]) == pytest.approx(analysis.best_fit.values[5], abs=0.01)
     assert [row[0] for row in mode_rows(analysis, 0, 2)[1]] == ["defocus (2, 0)", "astigmatism cos (2, 2)"]
 
@@ -122,9 +122,8 @@ def test_correction_table_says_which_limit_is_reached() -> None:
     assert [row[0] for row in shaped[5:]] == ["shape, astigmatism sin (2, -2)", "shape, defocus (2, 0)", "shape, astigmatism cos (2, 2)", "shape, farthest point"]
 
 
-@pytest.mark.parametrize("antenna", [PRIME, SHAPING, OFFSET], ids=["prime", "shaping", "offset"])
-def test_page_needs_no_network_and_escapes(antenna: Antenna) -> None:
-    analysis = analysis_of(antenna)
+def test_page_needs_no_network_and_escapes() -> None:
+    analysis = analysis_of(SHAPING)
     page = rf_report(analysis, "Gain <b>&", {"shape": "<script>alert(1)</script>"})
     tags = tags_of(page)
     assert all(link.startswith("data:") for link in tags.links)
@@ -134,24 +133,20 @@ def test_page_needs_no_network_and_escapes(antenna: Antenna) -> None:
     # gain curve, antenna, modes, margin, three maps of the surface, path errors; phase, cuts and pattern of the frequency
     assert tags.images == 11
     for words in NOT_MODELLED:
-        assert words.split(":")[0].replace("'", "&#x27;") in page
-    assert not re.search(r">nan<|\bnan\b ", page)
+        assert escape(words.split(":")[0]) in page
+    assert ">nan<" not in page
 
 
-def test_page_of_two_frequencies_without_a_correction() -> None:
-    analysis = analysis_of(PRIME, (15.0, 20.0), correct=False)
-    tags = tags_of(rf_report(analysis, "title", {}))
+def test_page_of_an_offset_dish_at_two_frequencies_without_a_correction() -> None:
+    tags = tags_of(rf_report(analysis_of(OFFSET, (15.0, 20.0), correct=False), "title", {}))
     # no curve of the margin, but phase, cuts and pattern twice
     assert tags.images == 13
 
 
-def test_page_of_a_perfect_dish() -> None:
+def test_page_of_a_perfect_dish_twice() -> None:
     plain = analysis_of(PRIME, correct=False)
     still = replace(plain.states[1], deformation=replace(plain.states[1].deformation, coefficients_mm=np.zeros(4)))
     flat = changed(plain, states=(plain.states[0], still), lost=(Change(0.0, 0.0, 0.0, 0.0),))
-    assert "costs 0 dB" in rf_report(flat, "title", {})
-
-
-def test_same_input_same_page() -> None:
-    analysis: RfAnalysis = analysis_of(PRIME, correct=False)
-    assert rf_report(analysis, "title", {}) == rf_report(analysis, "title", {})
+    page = rf_report(flat, "title", {})
+    assert "costs 0 dB" in page
+    assert page == rf_report(flat, "title", {})

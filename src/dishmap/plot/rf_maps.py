@@ -20,7 +20,7 @@ Bools = NDArray[np.bool_]
 
 PANEL_IN, BAR_IN = 3.5, 1.3
 # Fields are drawn on so many cells a side: contours of ten thousand nodes would make pages of many megabytes.
-SIDE = 241
+SIDE = 161
 # Targets are dots: smaller ones where there are many.
 DOT_AREA_PT2, SMALLEST_DOT_PT2, ROOMY_COUNT = 13.0, 1.5, 100
 # Room for hatching on the page: lines this many to the unit.
