@@ -76,7 +76,10 @@ def analysis_of(antenna: Antenna, frequencies_ghz: tuple[float, ...] = (20.0,), 
         states.append(antenna_state(name, antenna, shape, moved, frequencies_ghz, drawn))
         corrections[name] = _found(antenna, moved.values, frequencies_ghz)
     currents = sources(antenna, shape, still, sampled(antenna, shape, 15.0))
-    rows = tuple(ModeRow(term, size, SIGMA_MM, size**2, 0.01) for term, size in sorted(zip(TERMS, SIZES_MM.tolist()), key=lambda p: -p[1]))
+    rows = tuple(
+        ModeRow(term, size, SIGMA_MM, size**2, 0.01)
+        for term, size in sorted(zip(TERMS, SIZES_MM.tolist(), strict=True), key=lambda p: -p[1])
+    )
     count = len(frequencies_ghz)
     return RfAnalysis(
         antenna=antenna,

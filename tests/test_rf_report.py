@@ -49,7 +49,12 @@ def test_headline_says_what_it_costs_and_what_wins_it_back() -> None:
 
 def test_headline_takes_the_highest_frequency() -> None:
     plain = analysis_of(PRIME, correct=False)
-    two = changed(plain, options=replace(plain.options, frequencies_ghz=(20.0, 15.0)), lost=(Change(-1.0, 0.1, -1.2, -0.8), Change(-0.5, 0.1, -0.7, -0.3)))
+    two = changed(
+        plain,
+        options=replace(plain.options, frequencies_ghz=(20.0, 15.0)),
+        states=tuple(replace(state, readings=2 * state.readings) for state in plain.states),
+        lost=(Change(-1.0, 0.1, -1.2, -0.8), Change(-0.5, 0.1, -0.7, -0.3)),
+    )
     assert rf_verdict(two).headline.startswith("At 20 GHz the change of shape costs 1.00 ± 0.10 dB")
 
 
@@ -74,7 +79,8 @@ def test_warnings() -> None:
     )
     told = "\n".join(rf_verdict(unsure).warnings)
     assert "extrapolated" not in told
-    for words in ("one photograph", "did not come to rest", "stays where it is", "2 targets moved apart", "on their own by 1.00 mm"):
+    known = ("one photograph", "did not come to rest", "stays where it is", "2 targets moved apart", "on their own by 1.00 mm")
+    for words in known:
         assert words in told
     assert "wins nothing back" in rf_verdict(unsure).headline
 
@@ -103,9 +109,10 @@ def test_fixed_pointing_counts_on_the_boresight() -> None:
 
 def test_tables_hold_every_state_and_frequency() -> None:
     analysis = analysis_of(SHAPING, (15.0, 20.0))
+    wanted = [[f, s] for f in ("15", "20") for s in ("design", "measured", "corrected", "shaped")]
     for rows_of in (brief_rows, gain_rows, beam_rows, budget_rows):
         heads, rows = rows_of(analysis)
-        assert [row[:2] for row in rows] == [[f, s] for f in ("15", "20") for s in ("design", "measured", "corrected", "shaped")]
+        assert [row[:2] for row in rows] == wanted
         assert {len(row) for row in rows} == {len(heads)}
     gain = analysis.states[1].readings[1].beam.gain_dbi
     assert gain_rows(analysis)[1][5][2].startswith(f"{gain:.2f}")
@@ -119,7 +126,12 @@ def test_correction_table_says_which_limit_is_reached() -> None:
     assert [row[0] for row in rigid] == ["shift x", "shift y", "shift z", "tilt x", "tilt y"]
     assert [row[4] for row in rigid] == ["", "", "at its limit", "", ""]
     assert rigid[2][2:4] == ["+0.3000", "± 2"]
-    assert [row[0] for row in shaped[5:]] == ["shape, astigmatism sin (2, -2)", "shape, defocus (2, 0)", "shape, astigmatism cos (2, 2)", "shape, farthest point"]
+    assert [row[0] for row in shaped[5:]] == [
+        "shape, astigmatism sin (2, -2)",
+        "shape, defocus (2, 0)",
+        "shape, astigmatism cos (2, 2)",
+        "shape, farthest point",
+    ]
 
 
 def test_page_needs_no_network_and_escapes() -> None:

@@ -62,7 +62,9 @@ def _is_number(word: str) -> bool:
     help="One or more frequencies.",
 )
 @out_folder
-@click.option("--correct", is_flag=True, help="Find the pose (and shape, where it can change) of the subreflector or feed that wins most back.")
+@click.option(
+    "--correct", is_flag=True, help="Find the pose (and shape, where it can change) of the subreflector or feed that wins most back."
+)
 @click.option(
     "--pointing",
     type=click.Choice(["free", "fixed"]),
