@@ -16,7 +16,7 @@ from dishmap.rf.correction import correction_of, no_correction
 from dishmap.rf.deformation import undeformed
 from dishmap.rf.limits import value_names
 from dishmap.rf.margin import Margin
-from dishmap.rf.modes import ModeRow
+from dishmap.rf.modes import modes_of
 from dishmap.rf.shape_field import ShapeField, deformation_of, draws
 from dishmap.rf.sources import sampled, sources
 from dishmap.rf.state import antenna_state
@@ -60,7 +60,7 @@ def analysis_of(antenna: Antenna, frequencies_ghz: tuple[float, ...] = (20.0,), 
     if not correct:
         whole = analysis_of(antenna, frequencies_ghz)
         modes = {"measured": whole.modes["measured"]}
-        return replace(whole, states=whole.states[:2], modes=modes, corrections={}, recovered={}, margin=None)
+        return replace(whole, states=whole.states[:2], modes=modes, corrections={}, recovered={}, margins={})
     field, still = field_of(antenna), no_correction(antenna)
     shape, drawn = deformation_of(field), draws(field, np.random.default_rng(3), 20)
     states = [
@@ -76,11 +76,10 @@ def analysis_of(antenna: Antenna, frequencies_ghz: tuple[float, ...] = (20.0,), 
         states.append(antenna_state(name, antenna, shape, moved, frequencies_ghz, drawn))
         corrections[name] = _found(antenna, moved.values, frequencies_ghz)
     currents = sources(antenna, shape, still, sampled(antenna, shape, 15.0))
-    rows = tuple(
-        ModeRow(term, size, SIGMA_MM, size**2, 0.01)
-        for term, size in sorted(zip(TERMS, SIZES_MM.tolist(), strict=True), key=lambda p: -p[1])
-    )
+    radius = antenna.reflector.diameter_mm / 2
     count = len(frequencies_ghz)
+    sigmas = np.array([0.01, 0.1])
+    loss = np.tile(sigmas[:, None] ** 2, (1, count))
     return RfAnalysis(
         antenna=antenna,
         field=field,
@@ -88,11 +87,17 @@ def analysis_of(antenna: Antenna, frequencies_ghz: tuple[float, ...] = (20.0,), 
         options=RfOptions(frequencies_ghz, True, draws=20),
         best_fit=best_fit(antenna, shape, currents, field.factor_mm),
         states=tuple(states),
-        modes={state.name: (rows,) * count for state in states[1:]},
+        modes={
+            state.name: tuple(
+                modes_of((r.path.xy_mm - field.center_mm) / radius, r.path.half_path_mm, r.path.weight, r.wavelength_mm)
+                for r in state.readings
+            )
+            for state in states[1:]
+        },
         corrections=corrections,
         lost=(Change(-1.25, 0.03, -1.31, -1.19),) * count,
         recovered={name: (Change(0.75, 0.02, 0.71, 0.79),) * count for name in names},
-        margin=Margin(np.array([0.01, 0.1]), {name: np.array([0.001, 0.1]) for name in names}, SIGMA_MM),
+        margins={name: Margin(sigmas, frequencies_ghz, loss, 2 * loss, sigmas < 0.05) for name in names},
         target_beam=None,
         extrapolated_share=0.12,
     )

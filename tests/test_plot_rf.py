@@ -107,10 +107,10 @@ def test_motions_are_drawn_large_enough_to_see(name: str) -> None:
 
 
 def test_bars_and_margin() -> None:
-    loss, sigma = np.array([[0.8, 0.4], [0.0, 0.39]]), np.array([[0.02, 0.03], [np.nan, np.nan]])
-    assert is_svg(mode_bars(["defocus", "astigmatism"], ["measured", "corrected"], loss, sigma))
-    assert is_svg(mode_bars(["defocus", "astigmatism"], ["measured"], loss[:1], sigma[:1]))
+    loss = np.array([[0.8, 0.4], [-0.01, 0.39]])
+    assert is_svg(mode_bars(["defocus", "astigmatism"], ["measured", "corrected"], loss))
+    assert is_svg(mode_bars(["defocus", "astigmatism"], ["measured"], loss[:1]))
     error = np.array([0.01, 0.1, 1.0])
     # nothing left on the table has no logarithm
-    assert is_svg(margin_curves(error, {"corrected": error**2, "shaped": 0 * error}, 0.05))
-    assert is_svg(margin_curves(error, {"corrected": error**2}, 0.001))
+    assert is_svg(margin_curves({"corrected": (error, error**2, 2 * error**2), "shaped": (error, 0 * error, 0 * error)}, 0.05))
+    assert is_svg(margin_curves({"corrected": (error, error**2, error**2)}, 0.001))

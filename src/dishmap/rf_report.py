@@ -14,14 +14,17 @@ from dishmap.plot.rf_maps import aperture_maps, sigma_field
 from dishmap.plot.rf_pattern import gain_curves, pattern_cuts, pattern_maps
 from dishmap.report import inputs_section
 from dishmap.rf.analysis import RfAnalysis
+from dishmap.rf.aperture import spread_evenly
 from dishmap.rf.deformation import displacement
 from dishmap.rf.shape_field import extrapolated, sigma_at
 from dishmap.rf.state import Reading
 from dishmap.rf_assumptions import NOT_MODELLED, assumptions
-from dishmap.rf_tables import beam_rows, best_fit_rows, budget_rows, correction_rows, gain_rows, mode_label, mode_rows
-from dishmap.rf_verdict import QUANTITIES, rf_verdict, what_moves
+from dishmap.rf_tables import beam_rows, best_fit_rows, budget_rows, by_order, correction_rows, gain_rows, mode_label, mode_rows
+from dishmap.rf_verdict import QUANTITIES, highest, rf_verdict, target_sigma_mm, what_moves
 from dishmap.verdict import number
 
+# The displacement and its sigma are drawn from so many places.
+PLACES = 3000
 # Modes beyond these are in modes.csv.
 MOST_MODES = 14
 # Degrees of phase for each wavelength of path, twice since the error is half the path.
@@ -107,51 +110,56 @@ def _correction(analysis: RfAnalysis) -> str:
 def _modes(analysis: RfAnalysis) -> str:
     if not analysis.modes:
         return ""
-    readings = analysis.states[0].readings
-    top = int(np.argmax([r.frequency_ghz for r in readings]))
+    frequencies, top = analysis.options.frequencies_ghz, highest(analysis)
     names = list(analysis.modes)
     first = analysis.modes[names[0]][top][:MOST_MODES]
-    by_term = [{row.term: row for row in analysis.modes[name][top]} for name in names]
-    loss = np.array([[rows[one.term].loss_db if one.term in rows else np.nan for one in first] for rows in by_term])
-    sigma = np.array([[rows[one.term].sigma_db if one.term in rows else np.nan for one in first] for rows in by_term])
+    removed = np.array([[by_order(analysis, name, top)[mode.n, mode.m].removed_db for mode in first] for name in names])
     chart = figure(
-        mode_bars([mode_label(row.term) for row in first], names, loss, sigma),
-        f"What each mode costs at {readings[top].frequency_ghz:g} GHz, the dearest first: Zernike terms of the displacement along the "
-        f"normal.",
+        mode_bars([mode_label(mode.n, mode.m) for mode in first], names, removed),
+        f"What removing each mode of the half-path error would win back at {frequencies[top]:g} GHz, pointed anew, the dearest first.",
         "Bars of dB lost to each mode.",
     )
+    about = paragraph(
+        "Modes of the half-path error, weighed by the illumination: Zernike terms (n, m) with the sine and cosine term of one order "
+        "together. Size: "
+        "at the rim. Towards: azimuth of the first maximum, from x towards y. Alone: what the mode would cost if it were the only one. "
+        "Won back: what "
+        "removing it would win now; negative where it partly undoes others."
+    )
     tables = []
-    for place, reading in enumerate(readings):
-        tables += [f"<h3>{reading.frequency_ghz:g} GHz</h3>", table(*mode_rows(analysis, place, MOST_MODES), (0,))]
-    return section("Modes by what they cost", chart, *tables)
+    for place, frequency in enumerate(frequencies):
+        tables += [f"<h3>{frequency:g} GHz</h3>", table(*mode_rows(analysis, place, MOST_MODES), (0,))]
+    return section("Modes by what they cost", chart, about, *tables)
 
 
 def _margin(analysis: RfAnalysis) -> str:
-    margin = analysis.margin
-    if margin is None:
+    if not analysis.margins:
         return ""
+    top = highest(analysis)
+    curves = {name: (margin.sigma_mm, margin.mean_db[:, top], margin.high_db[:, top]) for name, margin in analysis.margins.items()}
     chart = figure(
-        margin_curves(margin.error_mm, dict(margin.left_db), margin.own_mm),
-        "How good the map must be: mean gain that a correction leaves on the table because the map it was made from has errors of this "
-        "size.",
-        "Curves of gain left against the error of the map.",
+        margin_curves(curves, target_sigma_mm(analysis)),
+        f"What a correction leaves on the table at {analysis.options.frequencies_ghz[top]:g} GHz because it was made from a map with "
+        f"this much "
+        "noise of each target: mean over maps, and as a thin line the worst of ten. Dashed: the median sigma of this map at its targets.",
+        "Curves of gain left against the noise of the map.",
     )
     return section("How good must the map be?", chart)
 
 
 def _surface(analysis: RfAnalysis) -> str:
     measured, field = analysis.states[1], analysis.field
-    path = measured.readings[0].path
-    value, _ = displacement(measured.deformation, path.xy_mm)
-    sigma, beyond = sigma_at(field, path.xy_mm), extrapolated(field, path.xy_mm)
+    xy = spread_evenly(PLACES, field.center_mm, field.radius_mm)
+    value, _ = displacement(measured.deformation, xy)
+    sigma, beyond = sigma_at(field, xy), extrapolated(field, xy)
     far = " Hatched: extrapolated, farther from any target than their spacing allows." if beyond.any() else ""
     moved = figure(
-        aperture_maps([path.xy_mm], [value], [""], field.center_mm, field.radius_mm, "displacement (mm)"),
+        aperture_maps([xy], [value], [""], field.center_mm, field.radius_mm, "displacement (mm)"),
         f"Displacement along the nominal normal, positive towards the focus: {QUANTITIES[analysis.quantity]}.",
         f"Map of the displacement, {number(float(np.sqrt(np.mean(value**2))))} mm rms.",
     )
     unsure = figure(
-        sigma_field(path.xy_mm, sigma, beyond, field.places_mm, field.center_mm, field.radius_mm, "sigma of the displacement (mm)"),
+        sigma_field(xy, sigma, beyond, field.places_mm, field.center_mm, field.radius_mm, "sigma of the displacement (mm)"),
         f"Sigma of the displacement; dots: the targets.{far}",
         "Map of the sigma of the displacement.",
     )

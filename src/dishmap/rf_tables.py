@@ -9,6 +9,7 @@ from dishmap.rf.analysis import DESIGN, RfAnalysis
 from dishmap.rf.best_fit import NAMES
 from dishmap.rf.correction import shape_terms
 from dishmap.rf.gain import Budget
+from dishmap.rf.modes import Mode
 from dishmap.rf.pattern import decibels
 from dishmap.rf.state import Reading, State
 from dishmap.rf_verdict import gain_of, loss_of
@@ -117,24 +118,35 @@ def best_fit_rows(analysis: RfAnalysis) -> Table:
     return ["", "nominal", "best fit"], rows
 
 
-def mode_label(term: tuple[int, int]) -> str:
+def term_label(term: tuple[int, int]) -> str:
     """`astigmatism cos (2, 2)`."""
     return f"{term_name(*term).replace('_', ' ')} ({term[0]}, {term[1]})"
 
 
+def mode_label(n: int, m: int) -> str:
+    """`astigmatism (2, 2)`, whatever its orientation."""
+    return term_label((n, m)).replace(" cos (", " (")
+
+
+def by_order(analysis: RfAnalysis, state: str, place: int) -> dict[tuple[int, int], Mode]:
+    """The modes of a state at the frequency at `place`, by degree and order."""
+    return {(mode.n, mode.m): mode for mode in analysis.modes[state][place]}
+
+
 def mode_rows(analysis: RfAnalysis, place: int, most: int) -> Table:
-    """The modes that cost most in the measured state at the frequency at `place`, with what they cost in the other states."""
+    """The modes that cost most in the measured state at the frequency at `place`, with what is left of them in the others."""
     names = list(analysis.modes)
-    by_term = {name: {row.term: row for row in analysis.modes[name][place]} for name in names}
-    first = analysis.modes[names[0]][place]
-    heads = ["mode (n, m)", "size at the rim (mm)", *(f"loss, {name} (dB)" for name in names)]
+    heads = ["mode (n, m)"]
+    for name in names:
+        heads += [f"{name}: size (mm)", "towards (°)", "alone (dB)", "won back (dB)"]
     rows = []
-    for one in first[:most]:
-        losses = []
+    for first in analysis.modes[names[0]][place][:most]:
+        cells = [mode_label(first.n, first.m)]
         for name in names:
-            row = by_term[name].get(one.term)
-            losses.append(NONE if row is None else _plain(row.loss_db, row.sigma_db, DB_DECIMALS))
-        rows.append([mode_label(one.term), with_sigma(one.coefficient_mm, one.sigma_mm, "", sign=True), *losses])
+            mode = by_order(analysis, name, place)[first.n, first.m]
+            cells += [_plain(mode.amplitude_mm, float("nan"), MM_DECIMALS), f"{mode.orientation_deg:.0f}" if mode.m else NONE]
+            cells += [_plain(value, float("nan"), DB_DECIMALS) for value in (mode.alone_db, mode.removed_db)]
+        rows.append(cells)
     return heads, rows
 
 
@@ -148,7 +160,7 @@ def correction_rows(analysis: RfAnalysis, name: str) -> Table:
         rows.append([value_name.replace("_", " "), unit, f"{value + 0.0:+.{MM_DECIMALS}f}", f"± {stroke:g}" if stroke else "fixed", at])
     if np.any(found.correction.shape_mm):
         for term, value in zip(shape_terms(moves), found.correction.shape_mm, strict=True):
-            rows.append([f"shape, {mode_label(term)}", "mm", f"{value + 0.0:+.{MM_DECIMALS}f}", "", ""])
+            rows.append([f"shape, {term_label(term)}", "mm", f"{value + 0.0:+.{MM_DECIMALS}f}", "", ""])
         at = "at its limit" if "shape_stroke" in found.limits else ""
         rows.append(["shape, farthest point", "mm", NONE, f"± {moves.shape_stroke_mm:g}", at])
     return ["actuator", "unit", "value", "stroke", ""], rows

@@ -32,6 +32,8 @@ TOLD_SHARE = 0.005
 LOUD_OWN = 3.0
 # Below this many wavelengths across, rays off a subreflector are a coarse picture.
 SMALL_SUB_WAVELENGTHS = 10.0
+# Of the nodes of the aperture, every so many-th shows the map's sigma well enough.
+EVERY = 7
 # Beyond this loss in dB a beam is in pieces, and gain alone says little.
 BROKEN_DB = 10.0
 
@@ -57,7 +59,14 @@ def loss_of(analysis: RfAnalysis, state: State, place: int) -> tuple[float, floa
 def map_sigma_mm(analysis: RfAnalysis) -> float:
     """Sigma of the displacement: root mean square over the aperture, weighed by the illumination."""
     path = analysis.state(MEASURED).readings[0].path
-    return float(np.sqrt((sigma_at(analysis.field, path.xy_mm) ** 2 @ path.weight) / path.weight.sum()))
+    some = slice(None, None, EVERY)
+    weight = path.weight[some]
+    return float(np.sqrt((sigma_at(analysis.field, path.xy_mm[some]) ** 2 @ weight) / weight.sum()))
+
+
+def target_sigma_mm(analysis: RfAnalysis) -> float:
+    """Median sigma of the displacement at the targets."""
+    return float(np.median(sigma_at(analysis.field, analysis.field.places_mm)))
 
 
 def what_moves(analysis: RfAnalysis) -> str:

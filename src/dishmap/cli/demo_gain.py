@@ -106,6 +106,7 @@ def true_shape(scene: Scene) -> Deformation:
     import numpy as np
 
     from dishmap.difference.changes import rigid_alignment
+    from dishmap.rf.aperture import spread_evenly
     from dishmap.rf.deformation import Deformation
     from dishmap.simulate.deform import deform
     from dishmap.surface.zernike import zernike_matrix, zernike_terms
@@ -116,10 +117,7 @@ def true_shape(scene: Scene) -> Deformation:
     radius = surface.diameter_mm / 2
     targets = pattern.center_mm
     moved = rigid_alignment(targets, deform(scene.deformation, surface, targets, radius), np.tile(np.eye(3), (len(targets), 1, 1)))
-    # places that cover the disc evenly: a sunflower's seeds
-    k = np.arange(PLACES) + 0.5
-    turn = np.pi * (1 + np.sqrt(5)) * k
-    xy = radius * np.sqrt(k / PLACES)[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+    xy = spread_evenly(PLACES, np.zeros(2), radius)
     nominal = np.column_stack([xy, (xy**2).sum(axis=1) / (4 * surface.focal_length_mm)])
     seen = moved.inverse().apply(deform(scene.deformation, surface, nominal, radius))
     terms = zernike_terms(TRUE_DEGREE)

@@ -36,7 +36,7 @@ GAIN_COLUMNS = (
     *("sidelobe_0_db", "sigma_sidelobe_0_db", "sidelobe_90_db", "sigma_sidelobe_90_db", "cross_db"),
     *("spillover", "illumination", "blockage", "phase", "rest", "efficiency"),
 )
-MODE_COLUMNS = ("state", "frequency_ghz", "n", "m", "name", "size_mm", "sigma_size_mm", "loss_db", "sigma_loss_db")
+MODE_COLUMNS = ("state", "frequency_ghz", "n", "m", "name", "half_path_mm", "orientation_deg", "alone_db", "won_back_db")
 
 
 @dataclass(frozen=True)
@@ -123,13 +123,14 @@ def _modes(analysis: RfAnalysis) -> Iterator[dict[str, Any]]:
     for state, by_frequency in analysis.modes.items():
         for frequency, rows in zip(analysis.options.frequencies_ghz, by_frequency, strict=True):
             for row in rows:
-                values = (state, frequency, *row.term, term_name(*row.term), row.coefficient_mm, row.sigma_mm, row.loss_db, row.sigma_db)
+                name = term_name(row.n, row.m).removesuffix("_cos")
+                values = (state, frequency, row.n, row.m, name, row.amplitude_mm, row.orientation_deg, row.alone_db, row.removed_db)
                 yield dict(zip(MODE_COLUMNS, values, strict=True))
 
 
 def rf_summary(analysis: RfAnalysis, provenance: RfProvenance) -> str:
     """The text of `summary.json`. Raises InputError when an input file cannot be read again."""
-    options, known, margin = analysis.options, analysis.field, analysis.margin
+    options, known = analysis.options, analysis.field
     fit = analysis.best_fit
     columns = zip(FIT_NAMES, fit.values, fit.sigma, strict=True)
     content: dict[str, Any] = {
@@ -159,7 +160,7 @@ def rf_summary(analysis: RfAnalysis, provenance: RfProvenance) -> str:
         "recovered": {name: [asdict(change) for change in changes] for name, changes in analysis.recovered.items()},
         "corrections": correction_content(analysis),
         "modes": list(_modes(analysis)),
-        "margin": None if margin is None else _plain(asdict(margin)),
+        "margins": {name: _plain(asdict(margin)) for name, margin in analysis.margins.items()},
         "seconds": {name: round(value, 3) for name, value in provenance.seconds.items()},
     }
     return json_text(content)

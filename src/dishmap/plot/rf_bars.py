@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from dishmap.plot.canvas import INK, Array, as_svg, new_figure
-from dishmap.plot.rf_pattern import OTHER_STYLE, STYLES, style_of
+from dishmap.plot.rf_pattern import style_of
 
 BARS_WIDTH_IN, BAR_IN, BARS_AXIS_IN = 8.4, 0.30, 1.1
 MARGIN_IN = (6.8, 4.5)
@@ -20,34 +20,33 @@ LEAST_DB = 1e-4
 
 
 @as_svg
-def mode_bars(names: Sequence[str], states: Sequence[str], loss_db: Array, sigma_db: Array) -> Figure:
-    """DB lost to each mode (M,) in each state, loss_db and sigma_db (S, M), with one sigma as error bar (none where it is NaN)."""
+def mode_bars(names: Sequence[str], states: Sequence[str], loss_db: Array) -> Figure:
+    """dB lost to each mode (M,) in each state: loss_db (S, M)."""
     figure, axes = new_figure(BARS_WIDTH_IN, BARS_AXIS_IN + BAR_IN * max(len(names), 3) * max(1.0, 0.6 * len(states)))
     thick = 0.8 / len(states)
     for k, state in enumerate(states):
         place = np.arange(len(names)) + (k - (len(states) - 1) / 2) * thick
         axes.barh(place, loss_db[k], color=style_of(state)["color"], height=0.92 * thick, label=state)
-        known = np.isfinite(sigma_db[k])
-        bars: dict[str, Any] = {"fmt": "none", "ecolor": INK, "elinewidth": 1.1, "capsize": 2.0}
-        axes.errorbar(loss_db[k][known], place[known], xerr=sigma_db[k][known], label="one sigma" if k == 0 else None, **bars)
     axes.axvline(0.0, color="#666666", linewidth=0.8)
     axes.set_yticks(np.arange(len(names)), names, fontsize=9.5)
-    axes.set(xlabel="loss (dB)", ylim=(len(names) - 0.4, -0.6))
+    axes.set(xlabel="won back by removing it (dB)", ylim=(len(names) - 0.4, -0.6))
     _grid(axes)
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderpad=0.0, ncols=4, columnspacing=1.2)
     return figure
 
 
 @as_svg
-def margin_curves(error_mm: Array, left_db: dict[str, Array], own_mm: float) -> Figure:
-    """Gain left on the table (E,) of each kind of correction against the map's error error_mm (E,), and this map's own error as a line."""
+def margin_curves(curves: Mapping[str, tuple[Array, Array, Array]], own_mm: float) -> Figure:
+    """Gain left on the table by each kind of correction: noise of a target in mm, mean and high loss in dB (E,); own_mm: of this map."""
     figure, axes = new_figure(*MARGIN_IN)
-    for name, left in left_db.items():
-        axes.plot(error_mm, np.maximum(left, LEAST_DB), marker="o", markersize=3.5, label=name, **STYLES.get(name, OTHER_STYLE))
+    for name, (sigma, mean, high) in curves.items():
+        style = style_of(name)
+        axes.plot(sigma, np.maximum(mean, LEAST_DB), marker="o", markersize=3.5, label=name, **style)
+        axes.plot(sigma, np.maximum(high, LEAST_DB), **{**style, "linewidth": 0.8})
     axes.axvline(own_mm, color=INK, linewidth=1.0, linestyle="--")
     at: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "xytext": (5, 0), "textcoords": "offset points", "va": "top"}
     axes.annotate(f"this map: {own_mm:.2g} mm", (own_mm, 0.97), **at)
-    axes.set(xscale="log", yscale="log", xlabel="rms error of the map (mm, one sigma)", ylabel="gain left on the table (dB)")
+    axes.set(xscale="log", yscale="log", xlabel="noise of each target of the map (mm, one sigma)", ylabel="gain left on the table (dB)")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

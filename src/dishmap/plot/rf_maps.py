@@ -11,7 +11,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
-from scipy.interpolate import griddata
+from scipy.spatial import cKDTree
 
 from dishmap.plot.canvas import DIVERGING, INK, SEQUENTIAL, Array, as_svg, color_norm
 from dishmap.plot.maps import dish_axes, map_figure, plain_ticks
@@ -21,6 +21,8 @@ Bools = NDArray[np.bool_]
 PANEL_IN, BAR_IN = 3.5, 1.3
 # Fields are drawn on so many cells a side: contours of ten thousand nodes would make pages of many megabytes.
 SIDE = 161
+# Each cell takes so many places around it; a little of a flat one where they lie in a line. Cells end this little beyond the rim, in radii.
+NEAREST, RIDGE, EDGE = 8, 1e-9, 1.02
 # Targets are dots: smaller ones where there are many.
 DOT_AREA_PT2, SMALLEST_DOT_PT2, ROOMY_COUNT = 13.0, 1.5, 100
 # Room for hatching on the page: lines this many to the unit.
@@ -63,11 +65,21 @@ def sigma_field(xy_mm: Array, sigma_mm: Array, beyond: Bools, targets_mm: Array,
 
 
 def _raster(xy: Array, values: Array, center: Array, radius: float) -> Array:
-    """Values at the cells of a square about the aperture: linear between the places, beyond them those of the nearest one."""
-    side = np.linspace(-radius, radius, SIDE)
-    x, y = np.meshgrid(center[0] + side, center[1] + side)
-    inside = griddata(xy, values, (x, y), method="linear")
-    return np.asarray(np.where(np.isfinite(inside), inside, griddata(xy, values, (x, y), method="nearest")))
+    """Values at the cells of a square about the aperture: of planes through the nearest places, by weighted least squares."""
+    side = np.linspace(-1.0, 1.0, SIDE)
+    cells = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    places = (xy - center) / radius
+    distance, near = cKDTree(places).query(cells, k=min(NEAREST, len(places)))
+    reach = distance[:, -1:] * (1 + 1e-9) + 1e-12
+    weight = (1 - (distance / reach) ** 2) ** 2 + 1e-6
+    columns = np.concatenate([np.ones((*near.shape, 1)), (places[near] - cells[:, None]) / reach[..., None]], axis=2)
+    left = np.einsum("ck,cki,ckj->cij", weight, columns, columns) + RIDGE * np.eye(3)
+    right = np.einsum("ck,cki,ck->ci", weight, columns, values[near])
+    out: Array = np.linalg.solve(left, right[..., None])[:, 0, 0]
+    # beyond the aperture nothing is drawn, and planes would lead far off
+    beyond = np.hypot(*cells.T) > EDGE
+    out[beyond] = values[near[beyond, 0]]
+    return out.reshape(SIDE, SIDE)
 
 
 def _field(axes: Axes, raster: Array, center: Array, radius: float, norm: Normalize, colors: str) -> None:

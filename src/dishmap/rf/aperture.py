@@ -54,6 +54,13 @@ def aperture_nodes(antenna: Antenna, rings: int, spokes: int, shadow_radius_mm: 
     return ApertureNodes(np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]), lit)
 
 
+def spread_evenly(count: int, center_mm: Array, radius_mm: float) -> Array:
+    """Places (count, 2) spread over a disc as the seeds of a sunflower are: each has the same area around it."""
+    k = np.arange(count) + 0.5
+    turn = np.pi * (1 + np.sqrt(5)) * k
+    return np.asarray(center_mm + radius_mm * np.sqrt(k / count)[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1))
+
+
 def _disc(center: Array, radius: float, rings: int, spokes: int) -> tuple[Array, Array]:
     rho, step = _rule(rings, np.zeros(1), np.full(1, radius))
     phi = 2 * np.pi * (np.arange(spokes) + 0.5) / spokes
