@@ -94,7 +94,7 @@ ORDER = [
     *("io.scenario_pattern", "io.scenario_file", "io.truth_file", "io.points_file", "io.measurement_file", "io.results"),
     *("io.difference_file", "io.difference_map_file", "io.difference_results", "io.board_file", "io.sheet_file"),
     *("io.grasp_text", "io.grasp_surface", "io.grasp_pattern", "io.antenna_file", "io.rf_netcdf", "io.cuts_csv"),
-    "io.shape_input",
+    *("io.shape_input", "io.mask_file", "io.rf_surface", "io.rf_correction", "io.rf_results"),
     # people: what a map says in words, in pictures, on a page
     *(
         "verdict",
@@ -116,10 +116,11 @@ ORDER = [
     *("planning_verdict", "planning_report", "io.plan_file"),
     # and what an antenna's gain says
     *("plot.rf_maps", "plot.rf_pattern", "plot.rf_bars", "plot.rf_antenna"),
+    *("rf_verdict", "rf_tables", "rf_assumptions", "rf_report"),
     # the program
     *("cli.terminal", "cli.options", "cli.prior_options", "cli.outcome", "cli.difference_outcome"),
     *("cli.board_options", "cli.calibrate", "cli.pattern", "cli.sheet", "cli.plan", "cli.simulate", "cli.undistort"),
-    *("cli.map", "cli.diff", "cli.demo", "cli.app", "__main__"),
+    *("cli.map", "cli.diff", "cli.rf", "cli.demo_gain", "cli.demo", "cli.app", "__main__"),
 ]
 
 # library -> modules (or packages) that may import it, and why only they

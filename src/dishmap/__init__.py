@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from dishmap.io.sheet_file import write_sheets
     from dishmap.pipeline import map_photograph
     from dishmap.planning import Conditions, camera_of_lens, plan
+    from dishmap.rf.analysis import RfAnalysis, RfOptions, analyse
     from dishmap.rf.antenna import Antenna
     from dishmap.rf.correct import best_correction
     from dishmap.sheet.boards import charuco, chessboard
@@ -72,11 +73,14 @@ _HOME = {
     "Pose": "dishmap.transforms",
     "PoseGuess": "dishmap.targets.identify",
     "Priors": "dishmap.difference.priors",
+    "RfAnalysis": "dishmap.rf.analysis",
+    "RfOptions": "dishmap.rf.analysis",
     "Scene": "dishmap.simulate.scene",
     "Sensor": "dishmap.simulate.scene",
     "Surface": "dishmap.targets.pattern",
     "TargetKind": "dishmap.targets.pattern",
     "Upright": "dishmap.targets.identify",
+    "analyse": "dishmap.rf.analysis",
     "as_printed": "dishmap.sheet.sheets",
     "best_correction": "dishmap.rf.correct",
     "board_sheets": "dishmap.sheet.sheets",
@@ -135,12 +139,15 @@ __all__ = [
     "Pose",
     "PoseGuess",
     "Priors",
+    "RfAnalysis",
+    "RfOptions",
     "Scene",
     "Sensor",
     "Surface",
     "TargetKind",
     "Upright",
     "__version__",
+    "analyse",
     "as_printed",
     "best_correction",
     "board_sheets",

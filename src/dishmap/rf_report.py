@@ -13,14 +13,14 @@ from dishmap.plot.rf_bars import margin_curves, mode_bars
 from dishmap.plot.rf_maps import aperture_maps, sigma_field
 from dishmap.plot.rf_pattern import gain_curves, pattern_cuts, pattern_maps
 from dishmap.report import inputs_section
-from dishmap.rf.analysis import RfAnalysis
+from dishmap.rf.analysis import BEAM, MEASURED, RfAnalysis
 from dishmap.rf.aperture import spread_evenly
 from dishmap.rf.deformation import displacement
 from dishmap.rf.shape_field import extrapolated, sigma_at
 from dishmap.rf.state import Reading
 from dishmap.rf_assumptions import NOT_MODELLED, assumptions
 from dishmap.rf_tables import beam_rows, best_fit_rows, budget_rows, by_order, correction_rows, gain_rows, mode_label, mode_rows
-from dishmap.rf_verdict import QUANTITIES, highest, rf_verdict, target_sigma_mm, what_moves
+from dishmap.rf_verdict import QUANTITIES, beam_words, highest, rf_verdict, target_sigma_mm, what_moves
 from dishmap.verdict import number
 
 # The displacement and its sigma are drawn from so many places.
@@ -43,6 +43,7 @@ def rf_report(analysis: RfAnalysis, title: str, inputs: dict[str, str]) -> str:
         section("What to know", bullet_list(verdict.warnings)) if verdict.warnings else "",
         _gain(analysis),
         _correction(analysis),
+        _target_beam(analysis),
         _modes(analysis),
         _margin(analysis),
         _surface(analysis),
@@ -83,7 +84,7 @@ def _gain(analysis: RfAnalysis) -> str:
 
 
 def _correction(analysis: RfAnalysis) -> str:
-    last = analysis.states[-1]
+    last = analysis.state([MEASURED, *analysis.corrections][-1])
     dish, moved = dish_factor(analysis.antenna, last.deformation), move_factor(analysis.antenna, last.correction)
     who = what_moves(analysis)
     caption = "The antenna along x and along y, sections through the middle of the aperture, projected; rays as designed."
@@ -105,6 +106,16 @@ def _correction(analysis: RfAnalysis) -> str:
         ]
         parts.append(paragraph(told) if told else "")
     return section("Correction" if analysis.corrections else "Antenna", sides, paragraph(about) if parts else "", *parts)
+
+
+def _target_beam(analysis: RfAnalysis) -> str:
+    """What was asked of the beam and what came of it."""
+    beam = analysis.target_beam
+    if beam is None:
+        return ""
+    words = paragraph(beam_words(analysis))
+    rows = table(*correction_rows(analysis, BEAM), (0, 1, 4))
+    return section("Target beam", words, rows)
 
 
 def _modes(analysis: RfAnalysis) -> str:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from dishmap.difference_verdict import with_sigma
-from dishmap.rf.analysis import DESIGN, RfAnalysis
+from dishmap.rf.analysis import BEAM, DESIGN, RfAnalysis
 from dishmap.rf.best_fit import NAMES
+from dishmap.rf.correct import CorrectionFound
 from dishmap.rf.correction import shape_terms
 from dishmap.rf.gain import Budget
 from dishmap.rf.modes import Mode
 from dishmap.rf.pattern import decibels
 from dishmap.rf.state import Reading, State
+from dishmap.rf.target_beam import BeamShaped
 from dishmap.rf_verdict import gain_of, loss_of
 from dishmap.surface.zernike import term_name
 
@@ -150,9 +152,15 @@ def mode_rows(analysis: RfAnalysis, place: int, most: int) -> Table:
     return heads, rows
 
 
+def commands_of(analysis: RfAnalysis) -> dict[str, CorrectionFound | BeamShaped]:
+    """Everything that the actuators may be told, by the state it makes."""
+    beam = analysis.target_beam
+    return {**analysis.corrections, **({} if beam is None else {BEAM: beam})}
+
+
 def correction_rows(analysis: RfAnalysis, name: str) -> Table:
-    """The actuators' values of a correction with their strokes."""
-    found, moves = analysis.corrections[name], analysis.antenna.actuators
+    """The actuators' values of a correction, or of a beam that is made with them, with their strokes."""
+    found, moves = commands_of(analysis)[name], analysis.antenna.actuators
     strokes = [*moves.shift_mm, *moves.tilt_deg]
     rows = []
     for value_name, unit, value, stroke in zip(found.names, found.units, found.correction.values, strokes, strict=False):

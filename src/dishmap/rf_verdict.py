@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from dishmap.difference_verdict import TOLD_SIGMAS, with_sigma
-from dishmap.rf.analysis import CORRECTED, DESIGN, MEASURED, Change, RfAnalysis
+from dishmap.rf.analysis import BEAM, CORRECTED, DESIGN, MEASURED, Change, RfAnalysis
+from dishmap.rf.goals import Broaden, Mask
 from dishmap.rf.shape_field import sigma_at
 from dishmap.rf.state import Reading, State
 from dishmap.verdict import Fact, Verdict, id_list, number, targets
@@ -85,7 +86,25 @@ def _headline(analysis: RfAnalysis) -> str:
     costs = f"At {frequency:g} GHz {WHO[analysis.quantity]} costs"
     told = -lost.mean_db >= TOLD_SIGMAS * lost.sigma_db
     text = f"{costs} {_db(lost, -1)}" if told else f"{costs} nothing that the map can tell from zero: {_db(lost, -1)}"
-    return f"{'; '.join([text, *(_wins(analysis, name, place) for name in analysis.recovered)])}."
+    parts = [text, *(_wins(analysis, name, place) for name in analysis.recovered)]
+    return f"{'; '.join(parts)}.{'' if analysis.target_beam is None else f' {beam_words(analysis)}'}"
+
+
+def beam_words(analysis: RfAnalysis) -> str:
+    """What was asked of the beam and what came of it, in one sentence."""
+    beam, goal = analysis.target_beam, analysis.options.goal
+    assert beam is not None
+    at = f"at {beam.frequency_ghz:g} GHz"
+    if isinstance(goal, Mask):
+        kept = "is kept" if beam.met else f"is missed by {-beam.after_db:.2f} dB at worst"
+        return f"Target beam {at}: the mask {kept} ({-beam.before_db:.2f} dB before)."
+    if isinstance(goal, Broaden):
+        bound = f"; no antenna could pass {beam.bound_dbi:.1f} dBi"
+        what = f"the lowest gain within {goal.radius_deg:g}° of the boresight"
+    else:
+        u, v = beam.directions_uv[0]
+        bound, what = "", f"the gain towards θ {np.degrees(np.arcsin(np.hypot(u, v))):.2f}°, φ {np.degrees(np.arctan2(v, u)) % 360:.0f}°"
+    return f"Target beam {at}: {what} goes from {beam.before_db:.2f} to {beam.after_db:.2f} dBi{bound}."
 
 
 def _wins(analysis: RfAnalysis, name: str, place: int) -> str:
@@ -163,7 +182,7 @@ def _beam_warnings(analysis: RfAnalysis) -> Iterator[str]:
                     f"they are "
                     "unwrapped by the geometry, but Ruze's estimate means nothing there."
                 )
-            if loss_of(analysis, state, place)[0] > BROKEN_DB:
+            if state.name != BEAM and loss_of(analysis, state, place)[0] > BROKEN_DB:
                 yield (
                     f"`{state.name}` at {reading.frequency_ghz:g} GHz: the beam has broken up; its peak is the strongest of several "
                     f"lobes, and "
@@ -172,6 +191,12 @@ def _beam_warnings(analysis: RfAnalysis) -> Iterator[str]:
 
 
 def _correction_warnings(analysis: RfAnalysis) -> Iterator[str]:
+    beam = analysis.target_beam
+    if beam is not None and beam.limits:
+        what = ", ".join(LIMIT_WORDS.get(limit, limit) for limit in beam.limits)
+        yield f"`{BEAM}`: the limit is reached of {what}; a longer stroke would come nearer."
+    if beam is not None and not beam.converged:
+        yield f"`{BEAM}`: the search did not come to rest; there may be a better command."
     for name, found in analysis.corrections.items():
         if found.limits:
             what = ", ".join(LIMIT_WORDS.get(limit, limit) for limit in found.limits)

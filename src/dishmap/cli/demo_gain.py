@@ -27,7 +27,7 @@ TRUE_DEGREE, PLACES = 24, 4000
 
 
 def deformed(scene: Scene) -> Scene:
-    """The same dish later: out of focus, a saddle, sagging between eight ribs, seen from a mount that gave way by a tenth of a millimetre."""
+    """The same dish later: out of focus, a saddle, sagging between eight ribs, and moved by a tenth of a millimetre."""
     import numpy as np
 
     from dishmap.simulate.deform import Deformation, Gores, ZernikeTerm

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ from dishmap.errors import InputError
 
 if TYPE_CHECKING:
     from dishmap.rf.analysis import RfAnalysis
+    from dishmap.rf.goals import Goal
 
 FREQUENCY = "--frequency-ghz"
 REPORT = "report.html"
@@ -94,14 +96,17 @@ def rf_command(shape: Path, antenna_file: Path, out: Path, **given: Any) -> None
 
     begin = time.perf_counter()
     antenna = read_antenna(antenna_file)
-    options = RfOptions(frequencies_of(given["frequencies"]), given["correct"], given["pointing"])
+    options = RfOptions(frequencies_of(given["frequencies"]), given["correct"], given["pointing"], goal_of(given["target_beam"]))
     quantity = quantity_of(shape_file(shape), given["whole_motion"])
     camera_file, pattern_file = given["camera_file"], given["pattern_file"]
     camera = None if camera_file is None else read_camera(camera_file)
     pattern = None if pattern_file is None else read_pattern(pattern_file)
     field = read_shape_field(shape, antenna.reflector, "shape" if quantity == "surface" else quantity, camera, pattern)
     read = time.perf_counter()
-    inputs = inputs_of(shape, antenna_file, camera_file, pattern_file)
+    mask = mask_of(given["target_beam"])
+    inputs = inputs_of(shape, antenna_file) | {
+        what: path for what, path in (("camera", camera_file), ("pattern", pattern_file), ("mask", mask)) if path is not None
+    }
     with output_folder(out):
         with progress("from shape to gain") as tell:
             analysis = analyse(field, quantity, antenna, options, lambda what, done, total: tell(done, total))
@@ -118,6 +123,33 @@ def frequencies_of(given: tuple[list[float], ...]) -> tuple[float, ...]:
     return frequencies
 
 
+def goal_of(given: str | None) -> Goal | None:
+    """The goal in the words of --target-beam. Raises InputError for words that are none."""
+    from dishmap.io.mask_file import read_mask
+    from dishmap.rf.goals import Broaden, Steer
+
+    if given is None:
+        return None
+    kind, _, rest = given.partition(":")
+    try:
+        if kind == "steer":
+            theta, phi = (float(part) for part in rest.split(","))
+            if abs(theta) < 90 and math.isfinite(phi):
+                return Steer.degrees(theta, phi)
+        if kind == "broaden":
+            return Broaden(float(rest))
+    except ValueError:
+        pass
+    if kind == "mask" and rest:
+        return read_mask(rest)
+    raise InputError(f"--target-beam {given!r} is none of steer:THETA,PHI (degrees), broaden:RADIUS_DEG and mask:FILE")
+
+
+def mask_of(given: str | None) -> Path | None:
+    """The file that --target-beam names, if it does."""
+    return Path(given.removeprefix("mask:")) if given is not None and given.startswith("mask:") else None
+
+
 def quantity_of(file: Path, whole_motion: bool) -> str:
     """What the shape in a file is of. Raises InputError for the motion of a map, which has none."""
     from dishmap.io.measurement_file import is_measurement
@@ -129,19 +161,13 @@ def quantity_of(file: Path, whole_motion: bool) -> str:
     return "displacement" if whole_motion else "shape"
 
 
-def inputs_of(shape: Path, antenna_file: Path, camera_file: Path | None, pattern_file: Path | None) -> dict[str, Path]:
-    """What each input file is -> its path."""
+def inputs_of(shape: Path, antenna_file: Path) -> dict[str, Path]:
+    """What each of the files behind a shape and an antenna is -> its path."""
     from dishmap.io.antenna_file import feed_path
     from dishmap.io.shape_input import shape_file
 
-    given = {
-        "shape": shape_file(shape),
-        "antenna": antenna_file,
-        "feed": feed_path(antenna_file),
-        "camera": camera_file,
-        "pattern": pattern_file,
-    }
-    return {what: path for what, path in given.items() if path is not None}
+    feed = feed_path(antenna_file)
+    return {"shape": shape_file(shape), "antenna": antenna_file, **({} if feed is None else {"feed": feed})}
 
 
 def leave(analysis: RfAnalysis, inputs: dict[str, Path], seconds: dict[str, float], title: str, out: Path) -> None:
@@ -161,14 +187,14 @@ def title_of(shape: Path) -> str:
 
 def print_analysis(analysis: RfAnalysis, title: str, out: Path) -> None:
     """Print what the shape costs and what wins it back."""
-    from dishmap.rf_tables import brief_rows, correction_rows
+    from dishmap.rf_tables import brief_rows, commands_of, correction_rows
     from dishmap.rf_verdict import rf_verdict
 
     verdict = rf_verdict(analysis)
     say(title)
     say(f"  {verdict.headline}")
     say(table(*brief_rows(analysis)))
-    for name in analysis.corrections:
+    for name in commands_of(analysis):
         heads, rows = correction_rows(analysis, name)
         say(f"  {name}:")
         say(table(heads, rows))

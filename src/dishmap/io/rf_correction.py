@@ -6,7 +6,7 @@ from typing import Any
 
 from dishmap.io.csv_table import format_csv
 from dishmap.io.results import json_text
-from dishmap.rf.analysis import RfAnalysis
+from dishmap.rf.analysis import BEAM, RfAnalysis
 from dishmap.rf.correction import RIGID, Correction
 
 FORMAT = "dishmap-correction/1"
@@ -34,8 +34,9 @@ def correction_files(analysis: RfAnalysis) -> dict[str, str]:
 
 
 def correction_content(analysis: RfAnalysis) -> dict[str, Any]:
-    """Every correction in JSON: its actuators, limits, and gain before and after by frequency."""
-    return {
+    """Every correction in JSON: its actuators, limits, and gain before and after by frequency; of a target beam its figure."""
+    beam = analysis.target_beam
+    out: dict[str, Any] = {
         name: {
             "actuators": _actuators(analysis, found.names, found.units, found.correction, found.limits),
             "limits": list(found.limits),
@@ -51,6 +52,19 @@ def correction_content(analysis: RfAnalysis) -> dict[str, Any]:
         }
         for name, found in analysis.corrections.items()
     }
+    if beam is not None:
+        out[BEAM] = {
+            "actuators": _actuators(analysis, beam.names, beam.units, beam.correction, beam.limits),
+            "limits": list(beam.limits),
+            "frequency_ghz": beam.frequency_ghz,
+            "before_db": beam.before_db,
+            "after_db": beam.after_db,
+            "bound_dbi": beam.bound_dbi,
+            "met": bool(beam.met),
+            "converged": bool(beam.converged),
+            "starts": int(beam.starts),
+        }
+    return out
 
 
 def _actuators(

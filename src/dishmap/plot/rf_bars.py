@@ -21,7 +21,7 @@ LEAST_DB = 1e-4
 
 @as_svg
 def mode_bars(names: Sequence[str], states: Sequence[str], loss_db: Array) -> Figure:
-    """dB lost to each mode (M,) in each state: loss_db (S, M)."""
+    """What each mode (M,) costs in each state, in dB: loss_db (S, M)."""
     figure, axes = new_figure(BARS_WIDTH_IN, BARS_AXIS_IN + BAR_IN * max(len(names), 3) * max(1.0, 0.6 * len(states)))
     thick = 0.8 / len(states)
     for k, state in enumerate(states):
