@@ -20,19 +20,19 @@ from dishmap.errors import InputError
 from dishmap.io.antenna_file import format_antenna
 from dishmap.io.difference_map_file import write_difference_map
 from dishmap.io.grasp_pattern import read_grd
-from dishmap.rf.antenna import Actuators, Antenna, Feed, Reflector, Subreflector
+from dishmap.rf.antenna import Antenna, Feed, Reflector, Subreflector
 from dishmap.rf.goals import Broaden, Mask, Steer
 from dishmap.targets.pattern import Pattern
 
 PRIME = Antenna(Reflector(300.0, 150.0), Feed("gaussian", 12.0))
-CASSEGRAIN = Antenna(PRIME.reflector, PRIME.feed, Subreflector("cassegrain", 110.0, 4.0), actuators=Actuators((2.0, 2.0, 2.0), (1.0, 1.0)))
+CASSEGRAIN = Antenna(PRIME.reflector, PRIME.feed, Subreflector("cassegrain", 110.0, 4.0))
 FREQUENCY_GHZ = 15.0
 
 
 def difference(folder: Path, pattern: Pattern) -> Path:
     """The folder of a difference of a dish or plate that lost its focus and got a saddle."""
     x, y = pattern.center_mm[:, :2].T / 150.0
-    joint = replace(joint_of(pattern), shape_mm=0.5 * (2 * (x**2 + y**2) - 1) + 0.3 * (x**2 - y**2))
+    joint = replace(joint_of(pattern), shape_mm=-0.5 * (2 * (x**2 + y**2) - 1) + 0.2 * (x**2 - y**2))
     folder.mkdir()
     write_difference_map(folder / "difference.npz", saved_difference(joint, pattern))
     return folder
@@ -85,8 +85,8 @@ def test_figures_agree_everywhere(corrected: tuple[Path, Result]) -> None:
     gains = {state: float(row["gain_dbi"]) for state, row in rows.items()}
     assert gains["measured"] - gains["design"] == pytest.approx(lost, abs=1e-6)
     assert gains["corrected"] - gains["measured"] == pytest.approx(won, abs=1e-6)
-    # the rigid pose takes the defocus, most of the loss, and leaves the saddle
-    assert 0.5 * -lost < won < -lost
+    # the rigid pose takes the defocus, which is most of the loss; a subreflector that comes nearer to the feed loses less past its rim
+    assert 0.05 < 0.5 * -lost < won
     said = re.search(r"At 15 GHz the change of shape costs ([\d.]+) ± [\d.]+ dB; moving the subreflector wins back ([\d.]+)", done.stdout)
     assert said is not None
     assert [float(one) for one in said.groups()] == pytest.approx([-lost, won], abs=2e-3)

@@ -152,9 +152,9 @@ def mask_of(given: str | None) -> Path | None:
 
 def quantity_of(file: Path, whole_motion: bool) -> str:
     """What the shape in a file is of. Raises InputError for the motion of a map, which has none."""
-    from dishmap.io.measurement_file import is_measurement
+    from dishmap.io.difference_map_file import is_difference_map
 
-    if is_measurement(file):
+    if file.suffix.lower() != ".csv" and not is_difference_map(file):
         if whole_motion:
             raise InputError(f"--whole-motion asks for the motion between two states, and {file} is a map of one; leave it out")
         return "surface"
