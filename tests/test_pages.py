@@ -63,7 +63,7 @@ def commands(page: str) -> list[str]:
     return [line.strip().removeprefix(".venv/bin/") for line in lines if re.match(r"    (\.venv/bin/)?dishmap ", line)]
 
 
-@pytest.mark.parametrize("line", [*commands("README.md"), *commands("docs/tutorial.md")])
+@pytest.mark.parametrize("line", [*commands("README.md"), *commands("docs/tutorial.md"), *commands("docs/rf.md")])
 def test_commands_have_the_options_that_the_pages_give(line: str) -> None:
     command: click.Command = program
     words = shlex.split(line)[1:]

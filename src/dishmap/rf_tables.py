@@ -165,10 +165,10 @@ def correction_rows(analysis: RfAnalysis, name: str) -> Table:
     rows = []
     for value_name, unit, value, stroke in zip(found.names, found.units, found.correction.values, strokes, strict=False):
         at = "at its limit" if value_name in found.limits else ""
-        rows.append([value_name.replace("_", " "), unit, f"{value + 0.0:+.{MM_DECIMALS}f}", f"± {stroke:g}" if stroke else "fixed", at])
+        rows.append([value_name.replace("_", " "), unit, _signed(value), f"± {stroke:g}" if stroke else "fixed", at])
     if np.any(found.correction.shape_mm):
         for term, value in zip(shape_terms(moves), found.correction.shape_mm, strict=True):
-            rows.append([f"shape, {term_label(term)}", "mm", f"{value + 0.0:+.{MM_DECIMALS}f}", "", ""])
+            rows.append([f"shape, {term_label(term)}", "mm", _signed(value), "", ""])
         at = "at its limit" if "shape_stroke" in found.limits else ""
         rows.append(["shape, farthest point", "mm", NONE, f"± {moves.shape_stroke_mm:g}", at])
     return ["actuator", "unit", "value", "stroke", ""], rows
@@ -183,6 +183,11 @@ def each_reading(analysis: RfAnalysis) -> list[tuple[int, State, Reading]]:
 def off_boresight_deg(reading: Reading) -> float:
     """Angle between the beam's peak and the boresight."""
     return float(np.degrees(np.arcsin(np.hypot(reading.beam.u, reading.beam.v))))
+
+
+def _signed(value: float) -> str:
+    # + 0.0 turns what rounds to minus zero into zero
+    return f"{round(float(value), MM_DECIMALS) + 0.0:+.{MM_DECIMALS}f}"
 
 
 def _plain(value: float, sigma: float, decimals: int) -> str:

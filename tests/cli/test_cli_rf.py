@@ -85,7 +85,7 @@ def test_figures_agree_everywhere(corrected: tuple[Path, Result]) -> None:
     gains = {state: float(row["gain_dbi"]) for state, row in rows.items()}
     assert gains["measured"] - gains["design"] == pytest.approx(lost, abs=1e-6)
     assert gains["corrected"] - gains["measured"] == pytest.approx(won, abs=1e-6)
-    # the rigid pose takes the defocus, which is most of the loss; a subreflector that comes nearer to the feed loses less past its rim
+    # the rigid pose takes the defocus, which is most of the loss, and changes spillover and illumination a little
     assert 0.05 < 0.5 * -lost < won
     said = re.search(r"At 15 GHz the change of shape costs ([\d.]+) ± [\d.]+ dB; moving the subreflector wins back ([\d.]+)", done.stdout)
     assert said is not None
@@ -95,7 +95,7 @@ def test_figures_agree_everywhere(corrected: tuple[Path, Result]) -> None:
     assert 20 * np.log10(np.nanmax(np.abs(grid.co))) == pytest.approx(gains["corrected"], abs=0.05)
     shift = next(one for one in summary["corrections"]["corrected"]["actuators"] if one["name"] == "shift_z")
     assert abs(shift["value"]) > 0.1
-    assert f"shift z       mm  {shift['value']:+.4f}" in done.stdout
+    assert re.search(rf"shift z +mm +{re.escape(format(shift['value'], '+.4f'))} ", done.stdout)
     assert summary["inputs"]["shape"]["path"].endswith("difference.npz")
 
 
