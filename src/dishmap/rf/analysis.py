@@ -19,6 +19,7 @@ from dishmap.rf.margin import Margin, gain_margin
 from dishmap.rf.modes import Mode, modes_of
 from dishmap.rf.shape_field import ShapeField, deformation_of, draws, extrapolated
 from dishmap.rf.sources import sampled, sources, wavelength_of
+from dishmap.rf.spread import FLOOR_DB
 from dishmap.rf.state import Reading, State, antenna_state
 from dishmap.rf.target_beam import BeamShaped, target_beam
 
@@ -189,7 +190,8 @@ class _Run:
         assert after.spread is not None
         drawn = after.spread.of(name) - (getattr(before.beam, name) if before.spread is None else before.spread.of(name))
         low, high = np.percentile(drawn, [2.5, 97.5])
-        return Change(getattr(after.beam, name) - getattr(before.beam, name), float(drawn.std()), float(low), float(high))
+        sigma = float(np.hypot(drawn.std(), FLOOR_DB))
+        return Change(getattr(after.beam, name) - getattr(before.beam, name), sigma, float(low) - FLOOR_DB, float(high) + FLOOR_DB)
 
     def fitted(self) -> tuple[BestFit, float]:
         """The best-fit paraboloid, and the share of the aperture's field where the map is extrapolated."""
