@@ -120,7 +120,7 @@ ORDER = [
     # the program
     *("cli.terminal", "cli.options", "cli.prior_options", "cli.outcome", "cli.difference_outcome"),
     *("cli.board_options", "cli.calibrate", "cli.pattern", "cli.sheet", "cli.plan", "cli.simulate", "cli.undistort"),
-    *("cli.map", "cli.diff", "cli.rf", "cli.demo", "cli.app", "__main__"),
+    *("cli.map", "cli.diff", "cli.rf", "cli.demo_gain", "cli.demo", "cli.app", "__main__"),
 ]
 
 # library -> modules (or packages) that may import it, and why only they

@@ -22,7 +22,7 @@ from dishmap.camera.calibrate import LENSES
 from dishmap.camera.model import Camera
 from dishmap.camera.problem import READOUTS
 from dishmap.cli import calibrate as calibrate_words
-from dishmap.cli import demo, pattern
+from dishmap.cli import demo, demo_gain, pattern
 from dishmap.io.camera_file import read_camera, read_views, write_camera
 from dishmap.io.images import read_gray
 from dishmap.io.pattern_file import read_pattern
@@ -256,6 +256,10 @@ def test_calibrate_mistakes(shot: Path, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+# Sizes of the shape that no photograph holds (the sag between ribs at the very rim), in gain.
+GAIN_ROUNDING_DB = 0.01
+
+
 @pytest.mark.usefixtures("short_report")
 def test_demo_compares_with_the_truth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from dataclasses import replace
@@ -264,18 +268,25 @@ def test_demo_compares_with_the_truth(tmp_path: Path, monkeypatch: pytest.Monkey
     scene = demo.demo_scene()
     small = Camera(1536, 1152, scene.camera.focal_px / 3, scene.camera.principal_px / 3, scene.camera.distortion)
     monkeypatch.setattr(demo, "demo_scene", lambda: replace(scene, camera=small, background=()))
+    monkeypatch.setattr(demo_gain, "FREQUENCIES_GHZ", (12.5,))
+    monkeypatch.setattr("dishmap.rf_report.rf_report", lambda analysis, title, inputs: title)
     done = dishmap("demo", "--out", tmp_path / "demo")
     assert done.exit_code == 0, done.stderr
     names = {path.name for path in (tmp_path / "demo").iterdir()}
-    results = {"points.csv", "points.ply", "surface.json", "summary.json", "report.html", "measurement.npz"}
-    assert names == {"photograph.png", "camera.yaml", "pattern.json", "truth.csv", *results}
+    results = {"points.csv", "points.ply", "surface.json", "summary.json", "report.html", "measurement.npz", "change", "gain"}
+    assert names == {"photograph.png", "later.png", "camera.yaml", "pattern.json", "antenna.toml", "truth.csv", *results}
     assert "130 of 130 targets measured" in done.stdout
     (inside,) = re.findall(r"z \(depth\) mm +[\d.]+ +[\d.]+ +(\d+)%", done.stdout)
     # 95 in 100 of 130 are 117 to 130 (4 sigma)
     assert int(inside) >= 88
-    words = re.search(r"the same again: dishmap (.*)", done.stdout)
-    assert words is not None
-    assert dishmap(*words[1].split()).exit_code == 0
+    # from photograph to corrected gain: claims are set beside the truth, and hold
+    rows = re.findall(r"(?:lost|won back) at 12.5 GHz, dB +([\d.]+) ± ([\d.]+) +([\d.]+)", done.stdout)
+    assert len(rows) == 2
+    for claimed, sigma, true in ((float(cell) for cell in row) for row in rows):
+        assert abs(claimed - true) < 4 * sigma + GAIN_ROUNDING_DB
+    again = re.findall(r"dishmap ((?:map|diff|rf) .*)", done.stdout)
+    assert [words.split()[0] for words in again] == ["map", "diff", "rf"]
+    assert dishmap(*again[0].split()).exit_code == 0
 
 
 def test_writing_a_camera_and_mapping_with_it_needs_no_other_words(shot: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""`dishmap demo`: the main job on a simulated photograph, with the error against its truth beside the sigmas claimed."""
+"""`dishmap demo`: from photographs of a simulated dish to its corrected gain, with the truth beside what is claimed."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from dishmap.cli.demo_gain import ANTENNA, CHANGE, FREQUENCIES_GHZ, GAIN, deformed, demo_antenna, show_gain
 from dishmap.cli.outcome import print_summary, write_outcome
 from dishmap.cli.simulate import CAMERA, PATTERN, TRUTH
 from dishmap.cli.terminal import progress, say, table
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-PHOTOGRAPH = "photograph.png"
+PHOTOGRAPH, LATER, MEASUREMENT = "photograph.png", "later.png", "measurement.npz"
 SEED = 1
 # 95 of 100 values lie within so many sigmas.
 WITHIN = 1.96
@@ -33,9 +34,13 @@ WITHIN = 1.96
     "--out", type=click.Path(path_type=Path), default="demo", show_default=True, metavar="DIR", help="Folder for photograph and results."
 )
 def demo_command(out: Path) -> None:
-    """Photograph a simulated 0.6 m dish (4608x3456 px), map it, and compare with the truth."""
+    """Photograph a simulated 0.6 m dish (4608x3456 px), map it, and compare with the truth.
+
+    Then deform it, photograph it again, say what changed, what that costs in gain and what moving the subreflector wins back.
+    """
     import numpy as np
 
+    from dishmap.io.antenna_file import format_antenna
     from dishmap.io.atomic import output_folder, write_files
     from dishmap.io.camera_file import camera_text, read_camera
     from dishmap.io.images import read_gray
@@ -48,13 +53,16 @@ def demo_command(out: Path) -> None:
 
     scene = demo_scene()
     with output_folder(out):
-        say(f"photographing a simulated dish with {len(scene.pattern)} targets ...")
-        shot = simulate(scene, np.random.default_rng(SEED))
+        say(f"photographing a simulated dish with {len(scene.pattern)} targets, twice: as built, and deformed ...")
+        later = deformed(scene)
+        shot, again = (simulate(one, np.random.default_rng(seed)) for one, seed in ((scene, SEED), (later, SEED + 1)))
         files: dict[str, str | bytes] = {
             PHOTOGRAPH: picture_bytes(shot.image),
             CAMERA: camera_text(scene.camera),
             PATTERN: format_pattern(scene.pattern),
-            TRUTH: format_truth([(PHOTOGRAPH, shot.truth)]),
+            LATER: picture_bytes(again.image),
+            TRUTH: format_truth([(PHOTOGRAPH, shot.truth), (LATER, again.truth)]),
+            ANTENNA: format_antenna(demo_antenna()),
         }
         write_files(out, files)
         # from here on as `dishmap map` does, from the files
@@ -68,8 +76,21 @@ def demo_command(out: Path) -> None:
     print_summary(result, str(out / PHOTOGRAPH), out)
     say()
     say(comparison(result, shot.truth))
-    photo, camera_file, pattern_file = (out / name for name in (PHOTOGRAPH, CAMERA, PATTERN))
-    say(f"the same again: dishmap map {photo} --camera {camera_file} --pattern {pattern_file} --out {out}")
+    say()
+    files_of = {"reference": out / PHOTOGRAPH, "camera": out / CAMERA, "pattern": out / PATTERN}
+    show_gain(result, later, out / LATER, files_of, out)
+    say()
+    _same_again(out)
+
+
+def _same_again(out: Path) -> None:
+    """The commands that do the same on the files of the demo."""
+    photo, later, antenna, change, gain = (out / name for name in (PHOTOGRAPH, LATER, ANTENNA, CHANGE, GAIN))
+    words = f"--camera {out / CAMERA} --pattern {out / PATTERN}"
+    say(f"the same again: dishmap map {photo} {words} --out {out}")
+    say(f"                dishmap diff {out / MEASUREMENT} {later} {words} --out {change}")
+    frequencies = " ".join(f"{frequency:g}" for frequency in FREQUENCIES_GHZ)
+    say(f"                dishmap rf {change} --antenna {antenna} --frequency-ghz {frequencies} --correct --out {gain}")
 
 
 def demo_scene() -> Scene:

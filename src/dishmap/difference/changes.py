@@ -183,7 +183,7 @@ def rigid_alignment(reference_mm: Array, current_mm: Array, covariance_mm2: Arra
             f"only {len(reference_mm)} targets were measured in both photographs; a difference needs at least {LEAST_TARGETS}"
         )
     information = np.linalg.inv(covariance_mm2)
-    pose = _kabsch(reference_mm, current_mm)
+    pose = kabsch(reference_mm, current_mm)
     for _ in range(ALIGN_STEPS):
         at = pose.apply(reference_mm)
         gap, middle = current_mm - at, at.mean(axis=0)
@@ -207,7 +207,7 @@ def rigid_columns(points: Array) -> Array:
     return np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -cross_matrix(points)], axis=2)
 
 
-def _kabsch(a: Array, b: Array) -> Pose:
+def kabsch(a: Array, b: Array) -> Pose:
     """Least-squares rigid motion from points a to points b (Kabsch 1976)."""
     middle_a, middle_b = a.mean(axis=0), b.mean(axis=0)
     u, _, vt = np.linalg.svd((a - middle_a).T @ (b - middle_b))
