@@ -19,7 +19,7 @@ from dishmap.rf.deformation import displacement
 from dishmap.rf.shape_field import extrapolated, sigma_at
 from dishmap.rf.state import Reading
 from dishmap.rf_assumptions import NOT_MODELLED, assumptions
-from dishmap.rf_tables import beam_rows, best_fit_rows, budget_rows, by_order, correction_rows, gain_rows, mode_label, mode_rows
+from dishmap.rf_tables import beam_rows, best_fit_rows, budget_rows, by_order, correction_rows, dear_modes, gain_rows, mode_label, mode_rows
 from dishmap.rf_verdict import QUANTITIES, beam_words, highest, rf_verdict, target_sigma_mm, what_moves
 from dishmap.verdict import number
 
@@ -79,8 +79,8 @@ def _gain(analysis: RfAnalysis) -> str:
         "Efficiency is gain over (π D/λ)². Spillover: power that meets the dish; illumination: evenness of the field over the aperture; "
         "blockage: what shadows leave; phase: what path errors leave at the beam's peak; rest: polarisation and what is not so simple."
     )
-    tables = [about, table(*gain_rows(analysis), (1,)), "<h3>Beam</h3>", beams, table(*beam_rows(analysis), (1,))]
-    return section("Gain", *tables, "<h3>Efficiency</h3>", parts, table(*budget_rows(analysis), (1,)), curve)
+    tables = [about, table(*gain_rows(analysis)), "<h3>Beam</h3>", beams, table(*beam_rows(analysis))]
+    return section("Gain", *tables, "<h3>Efficiency</h3>", parts, table(*budget_rows(analysis)), curve)
 
 
 def _correction(analysis: RfAnalysis) -> str:
@@ -123,7 +123,7 @@ def _modes(analysis: RfAnalysis) -> str:
         return ""
     frequencies, top = analysis.options.frequencies_ghz, highest(analysis)
     names = list(analysis.modes)
-    first = analysis.modes[names[0]][top][:MOST_MODES]
+    first = dear_modes(analysis, top, MOST_MODES)
     removed = np.array([[by_order(analysis, name, top)[mode.n, mode.m].removed_db for mode in first] for name in names])
     chart = figure(
         mode_bars([mode_label(mode.n, mode.m) for mode in first], names, removed),
@@ -146,13 +146,12 @@ def _modes(analysis: RfAnalysis) -> str:
 def _margin(analysis: RfAnalysis) -> str:
     if not analysis.margins:
         return ""
-    top = highest(analysis)
-    curves = {name: (margin.sigma_mm, margin.mean_db[:, top], margin.high_db[:, top]) for name, margin in analysis.margins.items()}
+    curves = {name: (margin.sigma_mm, margin.mean_db.mean(axis=1)) for name, margin in analysis.margins.items()}
     chart = figure(
         margin_curves(curves, target_sigma_mm(analysis)),
-        f"What a correction leaves on the table at {analysis.options.frequencies_ghz[top]:g} GHz because it was made from a map with "
-        f"this much "
-        "noise of each target: mean over maps, and as a thin line the worst of ten. Dashed: the median sigma of this map at its targets.",
+        "What a correction leaves on the table because it was made from a map with this much noise of each target: mean over maps and "
+        "over the "
+        "frequencies asked for. Dashed: the median sigma of this map at its targets.",
         "Curves of gain left against the noise of the map.",
     )
     return section("How good must the map be?", chart)

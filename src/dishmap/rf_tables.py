@@ -21,6 +21,8 @@ Table = tuple[list[str], list[list[str]]]
 
 NONE = "-"
 DB_DECIMALS, DEG_DECIMALS, MM_DECIMALS = 3, 4, 4
+# Modes that cost less are not told.
+LEAST_DB = 5e-4
 # Cross-polar fields below this are rounding.
 NO_CROSS_DB = -150.0
 PARTS = ("spillover", "illumination", "blockage", "phase", "rest", "total")
@@ -135,6 +137,15 @@ def by_order(analysis: RfAnalysis, state: str, place: int) -> dict[tuple[int, in
     return {(mode.n, mode.m): mode for mode in analysis.modes[state][place]}
 
 
+def dear_modes(analysis: RfAnalysis, place: int, most: int) -> list[Mode]:
+    """Modes of the first state that cost LEAST_DB or more in any state at the frequency at `place`, at least one; up to `most`."""
+    names = list(analysis.modes)
+    first = analysis.modes[names[0]][place]
+    others = [by_order(analysis, name, place) for name in names]
+    costs = [max(max(abs(rows[m.n, m.m].removed_db), abs(rows[m.n, m.m].alone_db)) for rows in others) for m in first]
+    return ([mode for mode, cost in zip(first, costs, strict=True) if cost >= LEAST_DB] or list(first[:1]))[:most]
+
+
 def mode_rows(analysis: RfAnalysis, place: int, most: int) -> Table:
     """The modes that cost most in the measured state at the frequency at `place`, with what is left of them in the others."""
     names = list(analysis.modes)
@@ -142,11 +153,11 @@ def mode_rows(analysis: RfAnalysis, place: int, most: int) -> Table:
     for name in names:
         heads += [f"{name}: size (mm)", "towards (°)", "alone (dB)", "won back (dB)"]
     rows = []
-    for first in analysis.modes[names[0]][place][:most]:
+    for first in dear_modes(analysis, place, most):
         cells = [mode_label(first.n, first.m)]
         for name in names:
             mode = by_order(analysis, name, place)[first.n, first.m]
-            cells += [_plain(mode.amplitude_mm, float("nan"), MM_DECIMALS), f"{mode.orientation_deg:.0f}" if mode.m else NONE]
+            cells += [_plain(mode.amplitude_mm, float("nan"), MM_DECIMALS), f"{round(mode.orientation_deg) + 0}" if mode.m else NONE]
             cells += [_plain(value, float("nan"), DB_DECIMALS) for value in (mode.alone_db, mode.removed_db)]
         rows.append(cells)
     return heads, rows

@@ -16,7 +16,7 @@ from dishmap.plot.rf_pattern import style_of
 BARS_WIDTH_IN, BAR_IN, BARS_AXIS_IN = 8.4, 0.30, 1.1
 MARGIN_IN = (6.8, 4.5)
 # The axis of gain left on the table begins no lower: less than that nobody sees.
-LEAST_DB = 1e-4
+LEAST_DB = 1e-5
 
 
 @as_svg
@@ -36,13 +36,11 @@ def mode_bars(names: Sequence[str], states: Sequence[str], loss_db: Array) -> Fi
 
 
 @as_svg
-def margin_curves(curves: Mapping[str, tuple[Array, Array, Array]], own_mm: float) -> Figure:
-    """Gain left on the table by each kind of correction: noise of a target in mm, mean and high loss in dB (E,); own_mm: of this map."""
+def margin_curves(curves: Mapping[str, tuple[Array, Array]], own_mm: float) -> Figure:
+    """Gain left on the table by each kind of correction: noise of a target in mm and mean loss in dB (E,); own_mm: of this map."""
     figure, axes = new_figure(*MARGIN_IN)
-    for name, (sigma, mean, high) in curves.items():
-        style = style_of(name)
-        axes.plot(sigma, np.maximum(mean, LEAST_DB), marker="o", markersize=3.5, label=name, **style)
-        axes.plot(sigma, np.maximum(high, LEAST_DB), **{**style, "linewidth": 0.8})
+    for name, (sigma, mean) in curves.items():
+        axes.plot(sigma, np.maximum(mean, LEAST_DB), marker="o", markersize=3.5, label=name, **style_of(name))
     axes.axvline(own_mm, color=INK, linewidth=1.0, linestyle="--")
     at: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "xytext": (5, 0), "textcoords": "offset points", "va": "top"}
     axes.annotate(f"this map: {own_mm:.2g} mm", (own_mm, 0.97), **at)
