@@ -29,7 +29,7 @@ Tell = Callable[[str, int, int], None]
 DESIGN, MEASURED, CORRECTED, SHAPED, BEAM = "design", "measured", "corrected", "shaped", "target beam"
 MOST_DRAWS = 10_000
 # Errors of the map (sigma of each target, mm) at which the gain left on the table is computed, and from how many maps each.
-MAP_ERRORS_MM, MARGIN_DRAWS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0), 30
+MAP_ERRORS_MM, MARGIN_DRAWS = (0.01, 0.03, 0.1, 0.3, 1.0), 30
 
 
 @dataclass(frozen=True)

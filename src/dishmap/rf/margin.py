@@ -2,12 +2,14 @@
 
 About the correction made from the truth, the best values follow the map linearly (implicit function theorem): with z the unknowns and c the
 coefficients of the map, dz = -H_zz^-1 H_zc dc, H the second derivatives of the gain, within the limits. Where the noise is too large for
-that, each map's correction is climbed to, on linear paths. What each correction gives on the true dish is the whole sum over the aperture.
+that, each map's correction is climbed to, on linear paths, and its difference to what the same climb makes of the exact map is taken. What
+each correction gives on the true dish is the whole sum over the aperture, with exact paths and the currents that it makes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,9 +22,9 @@ from dishmap.rf.beam import log_gain_slopes
 from dishmap.rf.climb import Aim, Place, aim_of, climb, convex, model
 from dishmap.rf.correct import CorrectionFound
 from dishmap.rf.deformation import Deformation
-from dishmap.rf.limits import Limits, best_step, limits_of, whole
+from dishmap.rf.limits import Limits, best_step, limits_of, whole, within
 from dishmap.rf.sources import illuminated, sampled, wavelength_of
-from dishmap.rf.surrogate import DB, Traced, co_moment, direction_of, fading, gain_dbi, linear_tracer, phase_slopes, tracer
+from dishmap.rf.surrogate import DB, Traced, Tracer, co_moment, direction_of, fading, gain_dbi, linear_tracer, phase_slopes, tracer
 from dishmap.surface.zernike import zernike_matrix
 
 Array = NDArray[np.float64]
@@ -32,6 +34,8 @@ LINEAR_RAD = 0.5
 POINTING_STEPS = 4
 # A value this near to its limit, as a share of the stroke, is held by it.
 HELD = 1e-3
+# Curvature along the ways of the actuators is taken over a step that costs so much, dB, at most this share of the full strokes.
+SHIFT_DB, SHIFT = 0.1, 0.1
 
 
 @dataclass(frozen=True)
@@ -61,14 +65,17 @@ def gain_margin(
     """What noise of the map costs the correction `found` for a deformation that is taken as the truth.
 
     response (T, N): coefficients of the terms (T), on the deformation's disc, for each mm of displacement at each of N targets; sigmas_mm:
-    of each target, independent. Whether the shape moves is as in `found`. Raises InputError for a response that does not fit its terms.
+    of each target, independent; draws: an even number. Whether the shape moves is as in `found`. Raises InputError for a response that does
+    not fit its terms.
     """
     if response.ndim != 2 or len(response) != len(terms):
         raise InputError(f"the response must have a row for each of the {len(terms)} terms, not the shape {response.shape}")
     shaped = bool(found.correction.shape_mm.any())
     limits = limits_of(antenna.actuators, shaped)
     about = _about(antenna, deformation, found, limits, terms)
-    unit = rng.standard_normal((draws, response.shape[1])) @ response.T
+    half = rng.standard_normal(((draws + 1) // 2, response.shape[1])) @ response.T
+    # in pairs of opposite noise: what is left of a slope at the best place cancels, and the mean is that of the curvature
+    unit = np.concatenate([half, -half])
     mean, high, linear = [], [], []
     for sigma in sigmas_mm:
         small = bool(sigma * _phase_rms(about, unit) < LINEAR_RAD)
@@ -81,9 +88,15 @@ def gain_margin(
 
 @dataclass(frozen=True)
 class _About:
-    """The true dish under its best correction: where it is, how paths (N, T) follow the map, and the quadratic model there."""
+    """The true dish under its best correction: where it is, how paths (N, T) follow the map, and the quadratic model there.
 
+    trace: the antenna with other values; climbed (P,): where a climb on linear paths ends without noise; best_dbi (F,).
+    """
+
+    antenna: Antenna
+    trace: Tracer
     place: Place
+    climbed: Array
     aim: Aim
     by_map: Array
     slope: Array
@@ -112,8 +125,30 @@ def _about(antenna: Antenna, deformation: Deformation, found: CorrectionFound, l
     towards = here.direction - np.array([0.0, 0.0, 1.0])
     by_map = (dish.normal * towards).sum(axis=1)[:, None] * zernike_matrix(tuple(terms), x, y)
     mixed = _mixed(place, aim, limits, by_map)
-    best = np.array([_peak_dbi(here, here, k, uv, aim.free) for k, uv in zip(aim.wavenumbers, place.uv, strict=True)])
-    return _About(place, aim, by_map, slope, bend, mixed, best)
+    best = np.array([_peak_dbi(here, k, uv, aim.free) for k, uv in zip(aim.wavenumbers, place.uv, strict=True)])
+    climbed = climb(linear_tracer(here), aim, limits, place.values, place.uv, fades=False).values
+    about = _About(antenna, trace, place, climbed, aim, by_map, slope, bend, mixed, best)
+    return replace(about, bend=_stiffened(about, limits))
+
+
+def _stiffened(about: _About, limits: Limits) -> Array:
+    """Second derivatives (Q, Q) with what moving light adds along the ways (principal axes) of the actuators.
+
+    Phases alone leave some ways nearly free (a subreflector that is shifted and tilted so that paths stay), along which light leaves the dish.
+    """
+    count, scale = len(limits.used), limits.scale
+    own, across, turn = about.bend[:count, :count], about.bend[:count, count:], about.bend[count:, count:]
+    free = (own - across @ np.linalg.solve(turn, across.T) if len(turn) else own) * np.outer(scale, scale)
+    values, vectors = np.linalg.eigh(free)
+    more = np.zeros(count)
+    for i, (value, way) in enumerate(zip(values, vectors.T, strict=True)):
+        step = min(SHIFT, np.sqrt(2 * SHIFT_DB / max(value, 1e-12)))
+        with suppress(InputError):
+            both = [_given(about, limits, about.place.values + sign * step * way * scale).mean() for sign in (-1, 1)]
+            more[i] = max((2 * about.best_dbi.mean() - sum(both)) / step**2 - value, 0.0)
+    out = about.bend.copy()
+    out[:count, :count] += (vectors * more) @ vectors.T / np.outer(scale, scale)
+    return out
 
 
 def _mixed(place: Place, aim: Aim, limits: Limits, by_map: Array) -> Array:
@@ -142,18 +177,25 @@ def _loss(about: _About, limits: Limits, change: Array, small: bool) -> Array:
         values = here.values + step[:count]
     else:
         seen = replace(here.traced, path_mm=here.traced.path_mm + about.by_map @ change)
-        values = climb(linear_tracer(seen), aim, limits, here.values, here.uv, fades=False).values
-    there = linear_tracer(here.traced)(whole(limits, values))
-    # the beam follows the actuators; Newton's method finds its peak from where it went to the first order
-    follow = -np.linalg.solve(about.bend[count:, count:], about.bend[count:, :count] @ (values - here.values)).reshape(-1, 2)
-    turned_uv = here.uv + follow if aim.free else here.uv
-    now = [_peak_dbi(there, here.traced, k, uv, aim.free) for k, uv in zip(aim.wavenumbers, turned_uv, strict=True)]
-    return about.best_dbi - np.array(now)
+        values = here.values + climb(linear_tracer(seen), aim, limits, here.values, here.uv, fades=False).values - about.climbed
+    return about.best_dbi - _given(about, limits, within(about.antenna.actuators, whole(limits, values))[limits.used])
 
 
-def _peak_dbi(traced: Traced, lit: Traced, k: float, uv: Array, free: bool) -> float:
+def _given(about: _About, limits: Limits, values: Array) -> Array:
+    """Gain in dB (F,) on the true dish with values (P,) of the actuators, pointed anew where that is free."""
+    here, aim, count = about.place, about.aim, len(limits.used)
+    there = about.trace(whole(limits, values), here.traced)
+    uv = here.uv
+    if aim.free:
+        # the beam follows the actuators; Newton's method finds its peak from where it went to the first order
+        follow = -np.linalg.solve(about.bend[count:, count:], about.bend[count:, :count] @ (values - here.values))
+        uv = uv + follow.reshape(-1, 2)
+    return np.array([_peak_dbi(there, k, one, aim.free) for k, one in zip(aim.wavenumbers, uv, strict=True)])
+
+
+def _peak_dbi(traced: Traced, k: float, uv: Array, free: bool) -> float:
     """Gain at the peak near a direction, or towards it where the pointing is fixed."""
-    moment = co_moment(lit, uv)
+    moment = co_moment(traced, uv)
     x, y, z = traced.point_mm.T
     for _ in range(POINTING_STEPS if free else 0):
         r = direction_of(uv)
