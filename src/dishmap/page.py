@@ -36,7 +36,7 @@ figcaption{font-size:14.5px;color:#333;margin-top:6px;max-width:90ch}
 table{border-collapse:collapse;font-size:14px;font-variant-numeric:tabular-nums}
 th,td{padding:3px 12px 3px 0;text-align:right;vertical-align:top;border-bottom:1px solid #e4e4e4}
 th{border-bottom:1.5px solid #888;font-weight:600;vertical-align:bottom}
-td.text,th.text{text-align:left;overflow-wrap:anywhere}
+td.text,th.text{text-align:left;overflow-wrap:anywhere;min-width:11ch}
 thead{display:table-header-group}
 tr{break-inside:avoid}
 @media print{

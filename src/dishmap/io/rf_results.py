@@ -22,6 +22,7 @@ from dishmap.io.rf_surface import regular_fields, surface_files
 from dishmap.rf.analysis import RfAnalysis
 from dishmap.rf.antenna import Antenna
 from dishmap.rf.best_fit import NAMES as FIT_NAMES
+from dishmap.rf.shape_field import ShapeField
 from dishmap.rf.spread import NAMES as SPREAD_NAMES
 from dishmap.rf.state import Reading, State
 from dishmap.surface.zernike import term_name
@@ -148,7 +149,7 @@ def rf_summary(analysis: RfAnalysis, provenance: RfProvenance) -> str:
             "extrapolated_share": analysis.extrapolated_share,
             "terms": [list(term) for term in known.terms],
             "coefficients_mm": known.mean_mm.tolist(),
-            "covariance_mm2": (known.factor_mm @ known.factor_mm.T).tolist(),
+            "sigma_mm": np.sqrt((known.factor_mm**2).sum(axis=1)).tolist(),
         },
         "best_fit": {
             **{name: {"value": float(value), "sigma": float(sigma)} for name, value, sigma in columns},
@@ -184,8 +185,22 @@ def _netcdf(analysis: RfAnalysis) -> bytes:
         "sweep_ghz": sweep,
         "sweep_dbi": gain,
         **regular_fields(analysis.field),
+        **_shape_variables(analysis.field),
     }
     return netcdf_bytes(variables, {"title": "dishmap rf", "quantity": analysis.quantity, "pointing": analysis.options.pointing})
+
+
+def _shape_variables(shape: ShapeField) -> dict[str, Variable]:
+    """The Zernike terms of the shape over the aperture's disc, with their whole covariance."""
+    orders = np.array(shape.terms, dtype=float)
+    return {
+        "term_n": Variable(("term",), orders[:, 0], "1", "degree of the Zernike term"),
+        "term_m": Variable(("term",), orders[:, 1], "1", "order of the Zernike term, negative for the sine"),
+        "coefficient": Variable(("term",), shape.mean_mm, "mm", "displacement along the normal in unnormalised Zernike terms"),
+        "coefficient_covariance": Variable(
+            ("term", "term_too"), shape.factor_mm @ shape.factor_mm.T, "mm2", "covariance of the coefficients between terms"
+        ),
+    }
 
 
 def _plain(value: Any) -> Any:

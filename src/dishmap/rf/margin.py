@@ -134,7 +134,7 @@ def _about(antenna: Antenna, deformation: Deformation, found: CorrectionFound, l
 def _stiffened(about: _About, limits: Limits) -> Array:
     """Second derivatives (Q, Q) with what moving light adds along the ways (principal axes) of the actuators.
 
-    Phases alone leave some ways nearly free (a subreflector that is shifted and tilted so that paths stay), along which light leaves the dish.
+    Phases alone leave some ways nearly free (a subreflector shifted and tilted so that paths stay), along which light leaves the dish.
     """
     count, scale = len(limits.used), limits.scale
     own, across, turn = about.bend[:count, :count], about.bend[:count, count:], about.bend[count:, count:]
