@@ -123,6 +123,7 @@ def _found(antenna: Antenna, values: Any, frequencies_ghz: tuple[float, ...]) ->
         agreeing=4,
         spread_db=0.2,
         improved=True,
+        lost_share=0.004,
     )
 
 

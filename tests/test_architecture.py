@@ -80,7 +80,8 @@ ORDER = [
     *("rf.feed", "rf.correction", "rf.subreflector", "rf.aperture", "rf.rays", "rf.sources", "rf.farfield"),
     *("rf.beam", "rf.gain", "rf.best_fit", "rf.spread", "rf.state"),
     # and how the subreflector wins gain back
-    *("rf.surrogate", "rf.limits", "rf.climb", "rf.starts", "rf.correct", "rf.modes", "rf.margin"),
+    *("rf.surrogate", "rf.limits", "rf.climb", "rf.starts", "rf.summits", "rf.illumination", "rf.bending"),
+    *("rf.correct", "rf.modes", "rf.margin"),
     *("rf.goals", "rf.target_beam"),
     "rf.analysis",
     # paper to print

@@ -5,8 +5,7 @@ minimises a quadratic model, made convex and damped (Levenberg-Marquardt), withi
 
 A rigid subreflector that moves far for its size also shifts the light on the dish. A climb that `fades` counts that: a step is kept when
 the gain with the new currents rises. How currents change is costly to know, so it is made new only when the climb comes to rest without.
-Other climbs hold the currents of each place for the step from there, and correct phases only: a subreflector bent to redistribute the
-light would be another antenna, with more gain than the undeformed one, and its rays might cross.
+Other climbs hold the currents of each place for the step from there, and correct phases only.
 """
 
 from __future__ import annotations
@@ -95,7 +94,7 @@ def climb(trace: Tracer, aim: Aim, limits: Limits, values: Array, uv: Array, fad
             break
         else:
             fade, fresh, renewed, damping = fading(trace, here.traced, limits.used, limits.scale), True, renewed + 1, DAMPING
-    return Summit(here.values, here.uv, -_level(here, here, aim), here.traced, settled)
+    return Summit(here.values, here.uv, mean_gain_dbi(here, aim), here.traced, settled)
 
 
 def _stepped(
@@ -123,6 +122,11 @@ def _level(place: Place, lit: Place, aim: Aim) -> float:
     """Minus the mean gain in dB, with the currents of the place `lit`."""
     parts = zip(aim.wavenumbers, place.uv, lit.uv, strict=True)
     return -float(np.mean([gain_dbi(place.traced, co_moment(lit.traced, old), k, uv) for k, uv, old in parts]))
+
+
+def mean_gain_dbi(place: Place, aim: Aim) -> float:
+    """The mean gain in dB at a place."""
+    return -_level(place, place, aim)
 
 
 def _ridge(place: Place, limits: Limits) -> float:

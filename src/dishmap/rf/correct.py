@@ -2,13 +2,14 @@
 
 One set of actuator values for all frequencies, so that the mean gain in dB is largest: at the beam's own peak when the antenna is pointed
 anew, or at the boresight. Climbs begin at the least-squares answer and, where phases wrap, at many places around it on a linear model
-of the paths; the best of those are climbed with exact paths. What comes out is judged apart, by full physical optics on more nodes.
+of the paths; the best of those are climbed with exact paths. A rigid pose is the one with the largest gain. A bend is sought with the
+illumination held as designed, since ray optics promises too much of a small subreflector that moves light about; among the bends found
+and the rigid pose the one with the largest gain is the answer. What comes out is judged apart, by full physical optics on more nodes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,21 +18,20 @@ from numpy.typing import NDArray
 from dishmap.errors import InputError
 from dishmap.rf.antenna import Antenna
 from dishmap.rf.beam import FARTHEST, REACH, beam_peak
-from dishmap.rf.climb import Aim, Summit, aim_of, climb
-from dishmap.rf.correction import RIGID, Correction, correction_of, no_correction
+from dishmap.rf.bending import best_bend
+from dishmap.rf.climb import Aim, aim_of
+from dishmap.rf.correction import Correction, correction_of, no_correction
 from dishmap.rf.deformation import Deformation
 from dishmap.rf.farfield import far_field
-from dishmap.rf.limits import Limits, limits_of, reached, value_names, within
+from dishmap.rf.limits import limits_of, reached, value_names, within
 from dishmap.rf.pattern import decibels
-from dishmap.rf.sources import Sources, illuminated, sampled, search_nodes, sources, wavelength_of
-from dishmap.rf.starts import Start, least_squares, starts_around
-from dishmap.rf.surrogate import Tracer, co_moment, gain_dbi, linear_tracer, tracer
+from dishmap.rf.sources import Illuminated, Sources, illuminated, sampled, search_nodes, sources, sources_after, wavelength_of
+from dishmap.rf.summits import highest
+from dishmap.rf.surrogate import Tracer, co_moment, gain_dbi, tracer
 
 Array = NDArray[np.float64]
 
 POINTINGS = ("free", "fixed")
-# So many of the best summits on the linear model are climbed again with exact paths; two closer than this in mean gain are one.
-EXACT, SAME_DB = 3, 1e-3
 # Starts that end within this of the best one agree with it.
 AGREE_DB = 0.01
 # A correction that raises the mean gain by less is none.
@@ -46,7 +46,8 @@ class CorrectionFound:
     `fixed`; before_dbi, after_dbi (F,): co-polar gain at the directions before_uv, after_uv (F, 2), by full physical optics; check_db (F,):
     after_dbi less what the search itself had found, whose nodes are fewer; limits: names of limits reached; converged: whether the best
     climb came to rest; starts: how many climbs were begun; agreeing: how many of them ended within AGREE_DB of the best; spread_db: the
-    best mean gain less the worst; improved: whether the mean gain rises at all.
+    best mean gain less the worst; improved: whether the mean gain rises at all; lost_share: of the power that the dish received before,
+    what misses it after the correction, negative where it receives more.
     """
 
     correction: Correction
@@ -65,6 +66,7 @@ class CorrectionFound:
     agreeing: int
     spread_db: float
     improved: bool
+    lost_share: float
 
 
 def best_correction(
@@ -78,8 +80,10 @@ def best_correction(
     """The values of the actuators that give the largest mean gain in dB over some frequencies.
 
     pointing: `free`: the antenna is pointed anew, gain counts at the beam's peak; `fixed`: at the boresight. shape: whether a subreflector
-    that can change its shape does so. progress: called with climbs done and all of them. Raises InputError for a frequency that is too low
-    or an unknown pointing, FitError when the deformed antenna has no main beam near the boresight.
+    that can change its shape does so: that never gives less than the rigid pose, nor a higher degree less than a lower one (to 1e-3 dB).
+    Light that a bend could win, by lighting the dish better than designed, is not sought. progress: called with what is done and all of
+    it. Raises InputError for a frequency that is too low or an unknown pointing, FitError when the deformed antenna has no main beam near
+    the boresight.
     """
     if pointing not in POINTINGS:
         raise InputError(f"the pointing must be 'free' or 'fixed', not {pointing!r}")
@@ -87,13 +91,14 @@ def best_correction(
         raise InputError("a correction needs at least one frequency in GHz")
     wavelengths = np.array([wavelength_of(antenna, f) for f in frequencies_ghz])
     aim = aim_of(wavelengths, antenna.reflector.diameter_mm, pointing == "free")
-    trace = tracer(antenna, illuminated(antenna, deformation, search_nodes(antenna, deformation, float(wavelengths.min()))))
+    dish = illuminated(antenna, deformation, search_nodes(antenna, deformation, float(wavelengths.min())))
+    trace = tracer(antenna, dish)
     before, before_uv = judged(antenna, deformation, no_correction(antenna), wavelengths, aim.free)
-    summit, ends = _highest(trace, aim, limits_of(antenna.actuators, shape), progress)
-    if len(summit.values) > len(RIGID):
-        # phases are not all that counts: a rigid pose that does better is the answer
-        rigid, _ = _highest(trace, aim, limits_of(antenna.actuators, False), None)
-        summit = max(summit, rigid, key=lambda s: s.mean_dbi)
+    bends = shape and antenna.actuators.shape_degree > 0
+    tell = progress or (lambda done, whole_of_it: None)
+    summit, ends = highest(trace, aim, limits_of(antenna.actuators, False), progress=None if bends else tell)
+    if bends:
+        summit, ends = best_bend(antenna.actuators, trace, dish.nodes.lit, aim, summit, tell)
     correction = correction_of(within(antenna.actuators, summit.traced.values))
     after, after_uv = judged(antenna, deformation, correction, wavelengths, aim.free)
     check = after - _searched(trace, correction, aim, after_uv)
@@ -116,6 +121,7 @@ def best_correction(
         agreeing=int((ends > ends.max() - AGREE_DB).sum()),
         spread_db=float(np.ptp(ends)),
         improved=improved,
+        lost_share=_lost_share(antenna, dish, correction) if improved else 0.0,
     )
 
 
@@ -140,40 +146,10 @@ def judging_sources(antenna: Antenna, deformation: Deformation, correction: Corr
     return sources(antenna, deformation, correction, sampled(antenna, deformation, wavelength_mm, widest))
 
 
-def _highest(trace: Tracer, aim: Aim, limits: Limits, progress: Callable[[int, int], None] | None) -> tuple[Summit, Array]:
-    """The best summit, and mean gains (S,) at which the climbs ended."""
-    tell = progress or (lambda done, whole_of_it: None)
-    best = least_squares(trace, aim, limits)
-    quick = linear_tracer(best.traced)
-    starts = starts_around(best, quick, aim, limits)
-    fades = not len(limits.heights)
-    ends = []
-    for i, start in enumerate(starts):
-        ends.append(climb(quick, aim, limits, *_of(start, aim), fades=False))
-        tell(i + 1, len(starts) + EXACT)
-    summits = []
-    for end in _different(ends)[:EXACT]:
-        # the exact antenna may not be able to go where the linear one went
-        with suppress(InputError):
-            summits.append(climb(trace, aim, limits, end.values, end.uv, fades))
-        tell(len(starts) + len(summits), len(starts) + EXACT)
-    if not summits:
-        summits.append(climb(trace, aim, limits, *_of(best.start, aim), fades))
-    tell(len(starts) + EXACT, len(starts) + EXACT)
-    return max(summits, key=lambda s: s.mean_dbi), np.array([e.mean_dbi for e in ends])
-
-
-def _of(start: Start, aim: Aim) -> tuple[Array, Array]:
-    return start.values, np.tile(start.uv, (len(aim.wavenumbers), 1))
-
-
-def _different(ends: list[Summit]) -> list[Summit]:
-    """Summits from the highest down, each height once."""
-    kept: list[Summit] = []
-    for end in sorted(ends, key=lambda e: -e.mean_dbi):
-        if not kept or kept[-1].mean_dbi - end.mean_dbi > SAME_DB:
-            kept.append(end)
-    return kept
+def _lost_share(antenna: Antenna, dish: Illuminated, correction: Correction) -> float:
+    lit = slice(0, dish.nodes.lit)
+    before, after = (sources_after(antenna, dish, c).arriving[lit].sum() for c in (no_correction(antenna), correction))
+    return float(1 - after / before)
 
 
 def _searched(trace: Tracer, correction: Correction, aim: Aim, uv: Array) -> Array:

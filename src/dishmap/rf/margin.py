@@ -113,6 +113,10 @@ def _about(antenna: Antenna, deformation: Deformation, found: CorrectionFound, l
     here = trace(found.correction.values)
     place = Place(found.correction.values[limits.used], found.after_uv, here)
     aim = aim_of(wavelengths, antenna.reflector.diameter_mm, found.pointing == "free")
+    if len(limits.heights):
+        # a bend is not where phases alone would have it; what an error of the map does is counted from there, with the currents of the bend
+        rest = climb(linear_tracer(here), aim, limits, place.values, place.uv, fades=False)
+        here, place = rest.traced, Place(rest.values, rest.uv, rest.traced)
     fade = None if len(limits.heights) else fading(trace, here, limits.used, limits.scale)
     slope, bend = model(place, aim, limits, fade)
     # at the best place only limits hold back what the slope asks for; the rest of it is rounding of the search

@@ -96,18 +96,16 @@ def fading(trace: Tracer, here: Traced, used: NDArray[np.int64], scale: Array) -
     weight = (np.abs(here.moment) ** 2).sum(axis=1)
     out = np.zeros((len(weight), len(used)), complex)
     for column, (index, full) in enumerate(zip(used, scale, strict=True)):
-        ends = []
         for step in (SMALL * full, -SMALL * full):
             moved = here.values.copy()
             moved[index] += step
             with suppress(InputError):
-                ends.append((trace(moved, here).moment, step))
-        if len(ends) == 2:
-            (after, up), (before, down) = ends
-            # where no ray arrives before or after, there is nothing to follow
-            seen = (weight > 0) & after.any(axis=1) & before.any(axis=1)
-            change = ((after - before) * here.moment.conj()).sum(axis=1)
-            out[seen, column] = change[seen] / weight[seen] / (up - down)
+                after = trace(moved, here).moment
+                # where no ray arrives before or after, there is nothing to follow
+                seen = (weight > 0) & after.any(axis=1)
+                change = ((after - here.moment) * here.moment.conj()).sum(axis=1)
+                out[seen, column] = change[seen] / weight[seen] / step
+                break
     return out
 
 
