@@ -97,7 +97,10 @@ def analysis_of(antenna: Antenna, frequencies_ghz: tuple[float, ...] = (20.0,), 
         corrections=corrections,
         lost=(Change(-1.25, 0.03, -1.31, -1.19),) * count,
         recovered={name: (Change(0.75, 0.02, 0.71, 0.79),) * count for name in names},
-        margins={name: Margin(sigmas, frequencies_ghz, loss, 2 * loss, sigmas < 0.05) for name in names},
+        margins={
+            name: Margin(sigmas, frequencies_ghz, loss, 2 * loss, sigmas < 0.05, np.full(len(corrections[name].names), 0.004))
+            for name in names
+        },
         target_beam=None,
         extrapolated_share=0.12,
     )

@@ -125,7 +125,7 @@ def test_correction_table_says_which_limit_is_reached() -> None:
     rigid, shaped = (correction_rows(analysis, name)[1] for name in ("corrected", "shaped"))
     assert [row[0] for row in rigid] == ["shift x", "shift y", "shift z", "tilt x", "tilt y"]
     assert [row[4] for row in rigid] == ["", "", "at its limit", "", ""]
-    assert rigid[2][2:4] == ["+0.3000", "± 2"]
+    assert rigid[2][2:4] == ["0.3000 ± 0.0040", "± 2"]
     assert [row[0] for row in shaped[5:]] == [
         "shape, astigmatism sin (2, -2)",
         "shape, defocus (2, 0)",

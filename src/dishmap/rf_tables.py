@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dishmap.difference_verdict import with_sigma
 from dishmap.rf.analysis import BEAM, DESIGN, RfAnalysis
@@ -17,6 +18,7 @@ from dishmap.rf.target_beam import BeamShaped
 from dishmap.rf_verdict import gain_of, loss_of
 from dishmap.surface.zernike import term_name
 
+Array = NDArray[np.float64]
 Table = tuple[list[str], list[list[str]]]
 
 NONE = "-"
@@ -169,17 +171,26 @@ def commands_of(analysis: RfAnalysis) -> dict[str, CorrectionFound | BeamShaped]
     return {**analysis.corrections, **({} if beam is None else {BEAM: beam})}
 
 
+def values_sigma(analysis: RfAnalysis, name: str) -> Array:
+    """What the map's covariance does to the actuators' values of a correction; 0 where that is not known, as for a beam."""
+    margin = analysis.margins.get(name)
+    return np.zeros(len(commands_of(analysis)[name].names)) if margin is None else margin.values_sigma
+
+
 def correction_rows(analysis: RfAnalysis, name: str) -> Table:
-    """The actuators' values of a correction, or of a beam that is made with them, with their strokes."""
+    """The actuators' values of a correction, or of a beam that is made with them, with sigmas from the map, and their strokes."""
     found, moves = commands_of(analysis)[name], analysis.antenna.actuators
     strokes = [*moves.shift_mm, *moves.tilt_deg]
+    sigmas = values_sigma(analysis, name)
     rows = []
-    for value_name, unit, value, stroke in zip(found.names, found.units, found.correction.values, strokes, strict=False):
+    for value_name, unit, value, sigma, stroke in zip(found.names, found.units, found.correction.values, sigmas, strokes, strict=False):
         at = "at its limit" if value_name in found.limits else ""
-        rows.append([value_name.replace("_", " "), unit, _signed(value), f"± {stroke:g}" if stroke else "fixed", at])
+        told = _signed(value) if sigma == 0 else with_sigma(float(value), float(sigma), "")
+        rows.append([value_name.replace("_", " "), unit, told, f"± {stroke:g}" if stroke else "fixed", at])
     if np.any(found.correction.shape_mm):
-        for term, value in zip(shape_terms(moves), found.correction.shape_mm, strict=True):
-            rows.append([f"shape, {term_label(term)}", "mm", _signed(value), "", ""])
+        for term, value, sigma in zip(shape_terms(moves), found.correction.shape_mm, sigmas[len(strokes) :], strict=True):
+            told = _signed(value) if sigma == 0 else with_sigma(float(value), float(sigma), "")
+            rows.append([f"shape, {term_label(term)}", "mm", told, "", ""])
         at = "at its limit" if "shape_stroke" in found.limits else ""
         rows.append(["shape, farthest point", "mm", NONE, f"± {moves.shape_stroke_mm:g}", at])
     return ["actuator", "unit", "value", "stroke", ""], rows

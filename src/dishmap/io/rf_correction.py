@@ -4,19 +4,25 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dishmap.io.csv_table import format_csv
 from dishmap.io.results import json_text
 from dishmap.rf.analysis import BEAM, RfAnalysis
-from dishmap.rf.correction import RIGID, Correction
+from dishmap.rf.correct import CorrectionFound
+from dishmap.rf.correction import RIGID
+from dishmap.rf.target_beam import BeamShaped
+
+Array = NDArray[np.float64]
 
 FORMAT = "dishmap-correction/1"
 CORRECTION_FILES = ("correction.json", "correction.csv")
-COLUMNS = ("state", "actuator", "value", "unit", "stroke", "at_limit")
+COLUMNS = ("state", "actuator", "value", "sigma", "unit", "stroke", "at_limit")
 FRAME = (
     "dish frame: origin at the vertex of the nominal paraboloid, z along the boresight towards the focus, right-handed",
     "turn first: tilt_x, tilt_y is the rotation vector (right-handed) about the subreflector's vertex, or the phase centre of a feed at "
-    "the "
-    "prime focus; then shift_x, shift_y, shift_z, positive along the axes of the dish",
+    "the prime focus; then shift_x, shift_y, shift_z, positive along the axes of the dish",
     "shape: unnormalised Zernike terms of the subreflector's height along its own z, over the disc of its rim, positive towards +z",
 )
 
@@ -26,7 +32,7 @@ def correction_files(analysis: RfAnalysis) -> dict[str, str]:
     found_all = correction_content(analysis)
     content = {"format": FORMAT, "convention": list(FRAME), "corrections": found_all}
     rows = [
-        {"state": name, "actuator": one["name"], **{key: one[key] for key in ("value", "unit", "stroke", "at_limit")}}
+        {"state": name, "actuator": one["name"], **{key: one[key] for key in ("value", "sigma", "unit", "stroke", "at_limit")}}
         for name, found in found_all.items()
         for one in found["actuators"]
     ]
@@ -38,7 +44,7 @@ def correction_content(analysis: RfAnalysis) -> dict[str, Any]:
     beam = analysis.target_beam
     out: dict[str, Any] = {
         name: {
-            "actuators": _actuators(analysis, found.names, found.units, found.correction, found.limits),
+            "actuators": _actuators(analysis, found, analysis.margins[name].values_sigma),
             "limits": list(found.limits),
             "pointing": found.pointing,
             "frequencies_ghz": list(found.frequencies_ghz),
@@ -54,7 +60,7 @@ def correction_content(analysis: RfAnalysis) -> dict[str, Any]:
     }
     if beam is not None:
         out[BEAM] = {
-            "actuators": _actuators(analysis, beam.names, beam.units, beam.correction, beam.limits),
+            "actuators": _actuators(analysis, beam, np.full(len(beam.names), np.nan)),
             "limits": list(beam.limits),
             "frequency_ghz": beam.frequency_ghz,
             "before_db": beam.before_db,
@@ -67,15 +73,22 @@ def correction_content(analysis: RfAnalysis) -> dict[str, Any]:
     return out
 
 
-def _actuators(
-    analysis: RfAnalysis, names: tuple[str, ...], units: tuple[str, ...], correction: Correction, limits: tuple[str, ...]
-) -> list[dict[str, Any]]:
+def _actuators(analysis: RfAnalysis, found: CorrectionFound | BeamShaped, sigmas: Array) -> list[dict[str, Any]]:
+    """Value of each actuator, its sigma from the map's covariance (none for a beam), stroke, and whether it is at its limit."""
     moves = analysis.antenna.actuators
     strokes = [*moves.shift_mm, *moves.tilt_deg]
-    strokes += [moves.shape_stroke_mm] * (len(names) - len(RIGID))
+    strokes += [moves.shape_stroke_mm] * (len(found.names) - len(RIGID))
+    rows = zip(found.names, found.units, found.correction.values, sigmas, strokes, strict=True)
     return [
-        {"name": name, "value": float(value), "unit": unit, "stroke": float(stroke), "at_limit": _limit_of(name) in limits}
-        for name, unit, value, stroke in zip(names, units, correction.values, strokes, strict=True)
+        {
+            "name": name,
+            "value": float(value),
+            "sigma": float(sigma) if np.isfinite(sigma) else None,
+            "unit": unit,
+            "stroke": float(stroke),
+            "at_limit": _limit_of(name) in found.limits,
+        }
+        for name, unit, value, sigma, stroke in rows
     ]
 
 
@@ -86,9 +99,8 @@ def _limit_of(name: str) -> str:
 def _before_and_after(analysis: RfAnalysis) -> list[str]:
     """Half-path rms of every state, as lines of a header."""
     return [
-        f"{state.name}: illumination-weighted half-path error {reading.path.weighted_rms_mm:.4f} mm rms, gain "
-        f"{reading.beam.gain_dbi:.3f} dBi "
-        f"at {reading.frequency_ghz:g} GHz"
+        f"{state.name}: illumination-weighted half-path error {reading.path.weighted_rms_mm:.4f} mm rms, "
+        f"gain {reading.beam.gain_dbi:.3f} dBi at {reading.frequency_ghz:g} GHz"
         for state in analysis.states
         for reading in state.readings
     ]

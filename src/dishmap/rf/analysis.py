@@ -172,7 +172,8 @@ class _Run:
     def margin(self, found: CorrectionFound) -> Margin:
         self.step("how good the map must be")
         rng = np.random.default_rng(self.options.seed)
-        return gain_margin(self.antenna, self.shape, found, self.field.terms, self.field.response, MAP_ERRORS_MM, rng, MARGIN_DRAWS)
+        known = self.field
+        return gain_margin(self.antenna, self.shape, found, known.terms, known.response, known.factor_mm, MAP_ERRORS_MM, rng, MARGIN_DRAWS)
 
     def modes(self, reading: Reading) -> tuple[Mode, ...]:
         path, main = reading.path, self.antenna.reflector

@@ -42,7 +42,8 @@ SHIFT_DB, SHIFT = 0.1, 0.1
 class Margin:
     """Loss of gain in dB against the correction made from the truth, for S sigmas of each target and F frequencies.
 
-    mean_db, high_db (S, F): mean and 90th percentile over draws; linear (S,): whether the linear response was used.
+    mean_db, high_db (S, F): mean and 90th percentile over draws; linear (S,): whether the linear response was used. values_sigma (P,): what
+    the map's own covariance does to all values of the correction, in their units; 0 for those that a limit holds or that do not move.
     """
 
     sigma_mm: Array
@@ -50,6 +51,7 @@ class Margin:
     mean_db: Array
     high_db: Array
     linear: NDArray[np.bool_]
+    values_sigma: Array
 
 
 def gain_margin(
@@ -58,18 +60,20 @@ def gain_margin(
     found: CorrectionFound,
     terms: Sequence[tuple[int, int]],
     response: Array,
+    factor_mm: Array,
     sigmas_mm: Sequence[float],
     rng: Generator,
     draws: int = 100,
 ) -> Margin:
     """What noise of the map costs the correction `found` for a deformation that is taken as the truth.
 
-    response (T, N): coefficients of the terms (T), on the deformation's disc, for each mm of displacement at each of N targets; sigmas_mm:
-    of each target, independent; draws: an even number. Whether the shape moves is as in `found`. Raises InputError for a response that does
-    not fit its terms.
+    response (T, N): coefficients of the terms (T), on the deformation's disc, for each mm of displacement at each of N targets; factor_mm
+    (T, R): of the covariance of the map's coefficients; sigmas_mm: of each target, independent; draws: an even number. Whether the shape
+    moves is as in `found`. Raises InputError for a response or factor that does not fit its terms.
     """
-    if response.ndim != 2 or len(response) != len(terms):
-        raise InputError(f"the response must have a row for each of the {len(terms)} terms, not the shape {response.shape}")
+    for what, matrix in (("response", response), ("factor", factor_mm)):
+        if matrix.ndim != 2 or len(matrix) != len(terms):
+            raise InputError(f"the {what} must have a row for each of the {len(terms)} terms, not the shape {matrix.shape}")
     shaped = bool(found.correction.shape_mm.any())
     limits = limits_of(antenna.actuators, shaped)
     about = _about(antenna, deformation, found, limits, terms)
@@ -83,7 +87,8 @@ def gain_margin(
         mean.append(losses.mean(axis=0))
         high.append(np.percentile(losses, 90, axis=0))
         linear.append(small)
-    return Margin(np.array(sigmas_mm, float), found.frequencies_ghz, np.array(mean), np.array(high), np.array(linear))
+    own = _values_sigma(about, limits, factor_mm)
+    return Margin(np.array(sigmas_mm, float), found.frequencies_ghz, np.array(mean), np.array(high), np.array(linear), own)
 
 
 @dataclass(frozen=True)
@@ -133,6 +138,18 @@ def _about(antenna: Antenna, deformation: Deformation, found: CorrectionFound, l
     climbed = climb(linear_tracer(here), aim, limits, place.values, place.uv, fades=False).values
     about = _About(antenna, trace, place, climbed, aim, by_map, slope, bend, mixed, best)
     return replace(about, bend=_stiffened(about, limits))
+
+
+def _values_sigma(about: _About, limits: Limits, factor_mm: Array) -> Array:
+    """Standard deviations (P of the whole vector) of the values that maps with this factor (T, R) of their covariance ask for."""
+    count = len(limits.used)
+    free = np.ones(len(about.bend), bool)
+    free[:count] = np.abs(about.place.values) <= (1 - HELD) * limits.scale
+    scale = np.concatenate([limits.scale, np.full(about.aim.extra, about.aim.unit)])[free]
+    bend = convex(about.bend[np.ix_(free, free)] * np.outer(scale, scale), 0.0)
+    moved = np.zeros((len(about.bend), factor_mm.shape[1]))
+    moved[free] = scale[:, None] * np.linalg.solve(bend, scale[:, None] * (about.mixed[free] @ factor_mm))
+    return whole(limits, np.sqrt((moved[:count] ** 2).sum(axis=1)))
 
 
 def _stiffened(about: _About, limits: Limits) -> Array:
