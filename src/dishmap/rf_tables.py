@@ -25,6 +25,8 @@ NONE = "-"
 DB_DECIMALS, DEG_DECIMALS, MM_DECIMALS = 3, 4, 4
 # Modes that cost less are not told.
 LEAST_DB = 5e-4
+# Sigmas of actuators below this, in mm or degrees, are rounding.
+LEAST_SIGMA = 1e-7
 # Cross-polar fields below this are rounding.
 NO_CROSS_DB = -150.0
 PARTS = ("spillover", "illumination", "blockage", "phase", "rest", "total")
@@ -185,11 +187,11 @@ def correction_rows(analysis: RfAnalysis, name: str) -> Table:
     rows = []
     for value_name, unit, value, sigma, stroke in zip(found.names, found.units, found.correction.values, sigmas, strokes, strict=False):
         at = "at its limit" if value_name in found.limits else ""
-        told = _signed(value) if sigma == 0 else with_sigma(float(value), float(sigma), "")
+        told = _with_sigma(value, sigma)
         rows.append([value_name.replace("_", " "), unit, told, f"± {stroke:g}" if stroke else "fixed", at])
     if np.any(found.correction.shape_mm):
         for term, value, sigma in zip(shape_terms(moves), found.correction.shape_mm, sigmas[len(strokes) :], strict=True):
-            told = _signed(value) if sigma == 0 else with_sigma(float(value), float(sigma), "")
+            told = _with_sigma(value, sigma)
             rows.append([f"shape, {term_label(term)}", "mm", told, "", ""])
         at = "at its limit" if "shape_stroke" in found.limits else ""
         rows.append(["shape, farthest point", "mm", NONE, f"± {moves.shape_stroke_mm:g}", at])
@@ -210,6 +212,11 @@ def off_boresight_deg(reading: Reading) -> float:
 def _signed(value: float) -> str:
     # + 0.0 turns what rounds to minus zero into zero
     return f"{round(float(value), MM_DECIMALS) + 0.0:+.{MM_DECIMALS}f}"
+
+
+def _with_sigma(value: float, sigma: float) -> str:
+    # the tilt of a feed at the prime focus changes its light, not paths: the map says nothing of it
+    return with_sigma(float(value), float(sigma), "") if sigma > LEAST_SIGMA else _signed(value)
 
 
 def _plain(value: float, sigma: float, decimals: int) -> str:
