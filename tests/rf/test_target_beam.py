@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dishmap.errors import InputError
+from dishmap.rf.antenna import Actuators, Antenna
 from dishmap.rf.correct import judged, judging_sources
 from dishmap.rf.correction import correction_of, no_correction
 from dishmap.rf.deformation import undeformed
@@ -18,6 +21,8 @@ from dishmap.rf.target_beam import _level, _quadratic, target_beam
 from tests.rf.dishes import CASSEGRAIN, PRIME, bent
 
 FLAT = undeformed(PRIME.reflector)
+# the judged gain of the lower degree's own answer, to the ends of searches
+SAME_DB = 0.01
 
 
 @pytest.mark.parametrize("antenna", [PRIME, CASSEGRAIN])
@@ -41,6 +46,16 @@ def test_a_broadened_beam_is_as_good_as_the_best_of_a_scan_through_focus() -> No
     assert done.after_db > done.before_db + 1.0
     assert done.after_db > max(scan) - 0.05
     assert done.after_db < done.bound_dbi
+
+
+def test_a_beam_broadened_by_a_bend_is_no_worse_than_by_a_pose_or_a_lower_degree() -> None:
+    lowest = [target_beam(antenna, FLAT, 30.0, Broaden(1.0)).after_db for antenna in (CASSEGRAIN, *(bending(n) for n in (2, 3)))]
+    assert lowest[1] > lowest[0] + 1.0
+    assert lowest[2] > lowest[1] - SAME_DB
+
+
+def bending(degree: int) -> Antenna:
+    return replace(CASSEGRAIN, actuators=Actuators(shape_degree=degree, shape_stroke_mm=3.0))
 
 
 def test_a_mask_that_can_be_kept_is_kept_and_one_that_cannot_is_reported() -> None:

@@ -18,7 +18,7 @@ from dishmap.errors import InputError
 from dishmap.rf.antenna import Actuators
 from dishmap.rf.climb import Aim, Place, Summit, climb, mean_gain_dbi
 from dishmap.rf.illumination import held_as_designed
-from dishmap.rf.limits import Limits, limits_of, whole
+from dishmap.rf.limits import Limits, limits_up_to, whole
 from dishmap.rf.summits import highest
 from dishmap.rf.surrogate import Tracer
 
@@ -35,11 +35,11 @@ def best_bend(
     trace: the antenna with currents as they are, of which the first `lit` cover the aperture; rigid: the summit of a rigid pose, whose
     values are those of RIGID that move.
     """
-    held = held_as_designed(trace, trace(np.zeros(_up_to(actuators, LOWEST_DEGREE).size)).moment, lit)
+    held = held_as_designed(trace, trace(np.zeros(limits_up_to(actuators, LOWEST_DEGREE).size)).moment, lit)
     best = start = rigid
     ends = np.zeros(0)
     for degree in range(LOWEST_DEGREE, actuators.shape_degree + 1):
-        limits = _up_to(actuators, degree)
+        limits = limits_up_to(actuators, degree)
         phases, ends = highest(trace, aim, limits, fades=False)
         reached = []
         for begin in (start, phases):
@@ -53,12 +53,6 @@ def best_bend(
         best = max([best, *(_as_it_is(trace, aim, limits, one) for one in reached)], key=lambda s: s.mean_dbi)
         progress(degree - LOWEST_DEGREE + 1, actuators.shape_degree - LOWEST_DEGREE + 1)
     return best, ends
-
-
-def _up_to(actuators: Actuators, degree: int) -> Limits:
-    """The limits of a subreflector that is bent up to a degree, for corrections with all its terms."""
-    lower = limits_of(replace(actuators, shape_degree=degree), True)
-    return replace(lower, size=limits_of(actuators, True).size)
 
 
 def _padded(values: Array, limits: Limits) -> Array:

@@ -7,7 +7,7 @@ quadratic: it is a least-squares problem with linear inequalities, solved as a l
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,14 @@ def limits_of(actuators: Actuators, shape: bool) -> Limits:
         height = _fan(terms, FAN)
         heights = np.hstack([np.zeros((len(height), len(RIGID))), height])[:, used]
     return Limits(used, scale[used], heights, actuators.shape_stroke_mm, len(scale))
+
+
+def limits_up_to(actuators: Actuators, degree: int) -> Limits:
+    """The limits of a subreflector that is bent up to a degree only, 0 for none, for corrections with all its terms."""
+    if not degree:
+        return limits_of(actuators, False)
+    lower = limits_of(replace(actuators, shape_degree=degree), True)
+    return replace(lower, size=len(RIGID) + len(shape_terms(actuators)))
 
 
 def value_names(actuators: Actuators) -> tuple[tuple[str, str], ...]:

@@ -29,6 +29,8 @@ LEAST_WAVELENGTHS = 3.0
 # what the steepest part of the deformation adds), and for each degree of the deformation.
 RINGS, SPOKES = (24, 0.6, 1), (64, 1.3, 3)
 SEARCH_RINGS, SEARCH_SPOKES = (7, 0.6, 0.5), (18, 1.3, 2)
+# A subreflector that can be bent is taken for a deformation of this degree at least.
+BENT_DEGREE = 6
 # More nodes than these come of a mistake in the input: a dish of 1 m at 30 GHz, several mm out of shape, takes a hundredth of them.
 MOST_NODES = 2_000_000
 # Half the angular width of the beam is about this over the diameter in wavelengths.
@@ -101,7 +103,9 @@ def _nodes(
 ) -> ApertureNodes:
     widest = max(widest, 3 * BEAM * wavelength_mm / antenna.reflector.diameter_mm)
     wavenumber, degree = 2 * np.pi / wavelength_mm, max((n for n, _ in deformation.terms), default=0)
-    degree = max(degree, antenna.actuators.shape_degree)
+    if antenna.actuators.shape_degree:
+        # the same nodes for all but the highest degrees, so that their searches see the same gain
+        degree = max(degree, BENT_DEGREE, antenna.actuators.shape_degree)
     phase = wavenumber * antenna.reflector.diameter_mm / 2 * widest
     steep = 2 * wavenumber * _steepest(antenna, deformation)
     counts = [base + slope * (phase + extra) + bent * degree for (base, slope, bent), extra in zip(needs, steep, strict=True)]

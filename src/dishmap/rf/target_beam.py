@@ -22,7 +22,7 @@ from dishmap.rf.deformation import Deformation
 from dishmap.rf.farfield import far_field
 from dishmap.rf.feed import ludwig_axes, polarization_axes
 from dishmap.rf.goals import Broaden, Goal, Mask, cost, directions, figure
-from dishmap.rf.limits import Limits, best_step, limits_of, reached, value_names, whole, within
+from dishmap.rf.limits import Limits, best_step, limits_up_to, reached, value_names, whole, within
 from dishmap.rf.pattern import decibels
 from dishmap.rf.sources import illuminated, search_nodes, wavelength_of
 from dishmap.rf.starts import Start, away, least_squares
@@ -33,7 +33,7 @@ Complex = NDArray[np.complex128]
 
 # A lowest gain is smoothed by so many dB, step after step.
 SMOOTH_DB = (2.0, 0.5, 0.15)
-STEPS, EXACT, SAME = 15, 4, 1e-4
+QUICK_STEPS, STEPS, EXACT, SAME = 15, 20, 3, 1e-4
 # Starts leave the correction along so many ways, by so many wavelengths of path (rms).
 WAYS, WAVES = 4, (0.15, 0.4)
 
@@ -80,14 +80,20 @@ def target_beam(
     wavelength = wavelength_of(antenna, frequency_ghz)
     aim = aim_of(np.array([wavelength]), antenna.reflector.diameter_mm, False)
     uv = directions(goal, aim.reach)
-    limits = limits_of(antenna.actuators, shape)
     nodes = search_nodes(antenna, deformation, wavelength, float(np.hypot(*uv.T).max()))
-    values, settled, count = _nearest(tracer(antenna, illuminated(antenna, deformation, nodes)), aim, limits, goal, uv, progress)
-    correction = correction_of(within(antenna.actuators, whole(limits, values)))
+    trace = tracer(antenna, illuminated(antenna, deformation, nodes))
     before = _gains(antenna, deformation, no_correction(antenna), wavelength, uv)
-    after = _gains(antenna, deformation, correction, wavelength, uv)
-    if figure(goal, after) < figure(goal, before):
-        correction, after = no_correction(antenna), before
+    correction, after, settled, count, known = no_correction(antenna), before, True, 0, np.zeros(0)
+    # a rigid pose first, then bends of more and more degrees, each begun at the best before: being able to do more never gives less
+    degree = antenna.actuators.shape_degree if shape else 0
+    for step in (0, *range(2, degree + 1)):
+        limits = limits_up_to(antenna.actuators, step)
+        known = np.pad(known, (0, len(limits.used) - len(known)))
+        values, rested, begun = _nearest(trace, aim, limits, goal, uv, progress, known, step in (0, 2, degree))
+        one = correction_of(within(antenna.actuators, whole(limits, values)))
+        gains, count = _gains(antenna, deformation, one, wavelength, uv), count + begun
+        if figure(goal, gains) >= figure(goal, after):
+            correction, after, settled, known = one, gains, rested, values
     names, units = zip(*value_names(antenna.actuators), strict=True)
     bound = 10 * np.log10(2 / (1 - np.cos(np.radians(goal.radius_deg)))) if isinstance(goal, Broaden) else np.nan
     achieved = figure(goal, after)
@@ -115,10 +121,16 @@ def _gains(antenna: Antenna, deformation: Deformation, correction: Correction, w
 
 
 def _nearest(
-    trace: Tracer, aim: Aim, limits: Limits, goal: Goal, uv: Array, progress: Callable[[int, int], None] | None
+    trace: Tracer, aim: Aim, limits: Limits, goal: Goal, uv: Array, progress: Callable[[int, int], None] | None, known: Array, wide: bool
 ) -> tuple[Array, bool, int]:
-    """The best values (P,), whether the search came to rest, and how many starts there were."""
+    """The best values (P,), whether the search came to rest, and how many starts there were.
+
+    known (P,): where it begins, with exact paths; wide: whether at other places too.
+    """
     tell = progress or (lambda done, whole_of_it: None)
+    finals = [_descend(trace, aim, limits, goal, uv, known, SMOOTH_DB, STEPS)]
+    if not wide:
+        return finals[0][0], finals[0][2], 1
     middle = uv.mean(axis=0) if not isinstance(goal, Mask) else np.zeros(2)
     best = least_squares(trace, aim, limits, middle)
     quick = linear_tracer(best.traced)
@@ -128,29 +140,28 @@ def _nearest(
         starts += [away(best, sign * far * shift * way, aim, limits) for way in best.ways[:WAYS] for far in WAVES for sign in (-1, 1)]
     ends = []
     for i, start in enumerate(starts):
-        ends.append(_descend(quick, aim, limits, goal, uv, start.values, SMOOTH_DB[:1]))
+        ends.append(_descend(quick, aim, limits, goal, uv, start.values, SMOOTH_DB[:1], QUICK_STEPS))
         tell(i + 1, len(starts) + EXACT)
-    finals = []
     ends.sort(key=lambda e: e[1])
     # ends at one cost are one place
     distinct = [e for i, e in enumerate(ends) if i == 0 or e[1] - ends[i - 1][1] > SAME]
     for i, (values, _, _) in enumerate(distinct[:EXACT]):
         with suppress(InputError):
-            finals.append(_descend(trace, aim, limits, goal, uv, values, SMOOTH_DB[1:]))
+            finals.append(_descend(trace, aim, limits, goal, uv, values, SMOOTH_DB[1:], STEPS))
         tell(len(starts) + i + 1, len(starts) + EXACT)
-    values, _, settled = min(finals or [_descend(trace, aim, limits, goal, uv, best.start.values, SMOOTH_DB)], key=lambda e: e[1])
-    return values, settled, len(starts)
+    values, _, settled = min(finals, key=lambda e: e[1])
+    return values, settled, len(starts) + 1
 
 
 def _descend(
-    trace: Tracer, aim: Aim, limits: Limits, goal: Goal, uv: Array, values: Array, smooth: tuple[float, ...]
+    trace: Tracer, aim: Aim, limits: Limits, goal: Goal, uv: Array, values: Array, smooth: tuple[float, ...], steps: int
 ) -> tuple[Array, float, bool]:
     """Descend to the least cost; values (P,), cost with the last smoothing, and whether it came to rest."""
     here, settled = trace(whole(limits, values)), False
     k = float(aim.wavenumbers[0])
     for smoothing in smooth:
         damping, settled = DAMPING, False
-        for _ in range(STEPS):
+        for _ in range(steps):
             level, slope, bend = _quadratic(here, k, limits, goal, uv, values, smoothing)
             while damping < HOPELESS:
                 step = best_step(slope, convex(bend, damping), limits, values, np.zeros(0), limits.scale, 1.0)
