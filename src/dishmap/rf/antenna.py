@@ -108,7 +108,8 @@ class Subreflector:
     """A hyperboloid between the focus and the dish (`cassegrain`) or an ellipsoid beyond the focus (`gregorian`).
 
     magnification M: equivalent focal length over the main one; foci_distance_mm: from F1 down to the feed; diameter_mm: of its rim, or
-    None for the one that just reflects the rays to the rim of the main reflector. Raises InputError for impossible values.
+    None for the one that just reflects the rays to the rim of the main reflector; a smaller one lights a smaller disc of the dish. Raises
+    InputError for impossible values.
     """
 
     kind: str
