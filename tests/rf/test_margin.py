@@ -31,7 +31,7 @@ def response() -> np.ndarray:
 def test_the_linear_loss_is_that_of_corrections_made_from_noisy_maps(antenna) -> None:
     found = best_correction(antenna, TRUTH, [30.0])
     sigma, draws = 1.0, 6
-    got = gain_margin(antenna, TRUTH, found, TERMS, response(), FACTOR, [sigma], np.random.default_rng(4), draws)
+    got = gain_margin(antenna, TRUTH, found, TERMS, [response()], FACTOR, [sigma], np.random.default_rng(4), draws)
     half = np.random.default_rng(4).standard_normal((draws // 2, 90)) @ response().T
     losses = []
     for change in (*half, *-half):
@@ -50,7 +50,7 @@ def test_loss_grows_with_the_square_of_the_noise_and_with_more_actuators() -> No
     loss = {}
     for name, shape in (("rigid", False), ("shape", True)):
         found = best_correction(SHAPED, TRUTH, [30.0, 12.5], shape=shape)
-        got = gain_margin(SHAPED, TRUTH, found, TERMS, response(), FACTOR, sigmas, np.random.default_rng(5), 30)
+        got = gain_margin(SHAPED, TRUTH, found, TERMS, [response()] * 3, FACTOR, sigmas, np.random.default_rng(5), 30)
         loss[name] = got.mean_db
         assert (got.high_db[1:] > got.mean_db[1:]).all()
     # the shape follows noise that no pose can follow
@@ -60,16 +60,16 @@ def test_loss_grows_with_the_square_of_the_noise_and_with_more_actuators() -> No
 
 def test_large_noise_is_climbed_for() -> None:
     found = best_correction(PRIME, TRUTH, [30.0])
-    got = gain_margin(PRIME, TRUTH, found, TERMS, response(), FACTOR, [0.1, 8.0], np.random.default_rng(6), 5)
+    got = gain_margin(PRIME, TRUTH, found, TERMS, [response()] * 2, FACTOR, [0.1, 8.0], np.random.default_rng(6), 5)
     assert got.linear.tolist() == [True, False]
     assert got.mean_db[1, 0] > got.mean_db[0, 0]
 
 
 def test_linear_and_climbed_losses_agree_where_both_hold(monkeypatch) -> None:
     found = best_correction(SHAPED, TRUTH, [30.0])
-    linear = gain_margin(SHAPED, TRUTH, found, TERMS, response(), FACTOR, [0.1], np.random.default_rng(7), 5)
+    linear = gain_margin(SHAPED, TRUTH, found, TERMS, [response()], FACTOR, [0.1], np.random.default_rng(7), 5)
     monkeypatch.setattr(margin_module, "LINEAR_RAD", 0.0)
-    climbed = gain_margin(SHAPED, TRUTH, found, TERMS, response(), FACTOR, [0.1], np.random.default_rng(7), 5)
+    climbed = gain_margin(SHAPED, TRUTH, found, TERMS, [response()], FACTOR, [0.1], np.random.default_rng(7), 5)
     assert climbed.mean_db[0, 0] == pytest.approx(linear.mean_db[0, 0], rel=SHARE, abs=1e-4)
 
 
@@ -78,7 +78,7 @@ def test_sigmas_of_the_values_are_those_of_corrections_made_anew(antenna) -> Non
     found = best_correction(antenna, TRUTH, [30.0])
     sigma = 0.02
     factor = sigma * np.eye(len(TERMS))
-    claimed = gain_margin(antenna, TRUTH, found, TERMS, response(), factor, [0.1], np.random.default_rng(4), 2).values_sigma
+    claimed = gain_margin(antenna, TRUTH, found, TERMS, [response()], factor, [0.1], np.random.default_rng(4), 2).values_sigma
     rng, values = np.random.default_rng(9), []
     for _ in range(12):
         change = dict(zip(TERMS, sigma * rng.standard_normal(len(TERMS)), strict=True))
@@ -95,5 +95,5 @@ def test_sigmas_of_the_values_are_those_of_corrections_made_anew(antenna) -> Non
 def test_a_response_that_does_not_fit_is_refused() -> None:
     found = best_correction(PRIME, TRUTH, [30.0])
     with pytest.raises(InputError, match="a row for each of the 14 terms"):
-        gain_margin(PRIME, TRUTH, found, TERMS, response()[1:], FACTOR, [0.1], np.random.default_rng(8))
+        gain_margin(PRIME, TRUTH, found, TERMS, [response()[1:]], FACTOR, [0.1], np.random.default_rng(8))
     assert TRUTH.radius_mm == RADIUS_MM

@@ -17,7 +17,7 @@ from dishmap.rf.deformation import undeformed
 from dishmap.rf.goals import Goal
 from dishmap.rf.margin import Margin, gain_margin
 from dishmap.rf.modes import Mode, modes_of
-from dishmap.rf.shape_field import ShapeField, deformation_of, draws, extrapolated
+from dishmap.rf.shape_field import ShapeField, deformation_of, draws, extrapolated, response_to_noise
 from dishmap.rf.sources import sampled, sources, wavelength_of
 from dishmap.rf.spread import FLOOR_DB
 from dishmap.rf.state import Reading, State, antenna_state
@@ -172,8 +172,9 @@ class _Run:
     def margin(self, found: CorrectionFound) -> Margin:
         self.step("how good the map must be")
         rng = np.random.default_rng(self.options.seed)
-        known = self.field
-        return gain_margin(self.antenna, self.shape, found, known.terms, known.response, known.factor_mm, MAP_ERRORS_MM, rng, MARGIN_DRAWS)
+        terms, factor = self.field.terms, self.field.factor_mm
+        responses = [response_to_noise(self.field, sigma) for sigma in MAP_ERRORS_MM]
+        return gain_margin(self.antenna, self.shape, found, terms, responses, factor, MAP_ERRORS_MM, rng, MARGIN_DRAWS)
 
     def modes(self, reading: Reading) -> tuple[Mode, ...]:
         path, main = reading.path, self.antenna.reflector

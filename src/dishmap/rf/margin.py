@@ -59,7 +59,7 @@ def gain_margin(
     deformation: Deformation,
     found: CorrectionFound,
     terms: Sequence[tuple[int, int]],
-    response: Array,
+    responses: Sequence[Array],
     factor_mm: Array,
     sigmas_mm: Sequence[float],
     rng: Generator,
@@ -67,21 +67,22 @@ def gain_margin(
 ) -> Margin:
     """What noise of the map costs the correction `found` for a deformation that is taken as the truth.
 
-    response (T, N): coefficients of the terms (T), on the deformation's disc, for each mm of displacement at each of N targets; factor_mm
-    (T, R): of the covariance of the map's coefficients; sigmas_mm: of each target, independent; draws: an even number. Whether the shape
-    moves is as in `found`. Raises InputError for a response or factor that does not fit its terms.
+    sigmas_mm: of each of N targets, independent; responses (T, N): for each of these, coefficients of the terms (T), on the deformation's
+    disc, for each mm of displacement of a target; factor_mm (T, R): of the covariance of the map's coefficients; draws: an even number.
+    Whether the shape moves is as in `found`. Raises InputError for a response or factor that does not fit its terms.
     """
-    for what, matrix in (("response", response), ("factor", factor_mm)):
+    for what, matrix in (*(("response", one) for one in responses), ("factor", factor_mm)):
         if matrix.ndim != 2 or len(matrix) != len(terms):
             raise InputError(f"the {what} must have a row for each of the {len(terms)} terms, not the shape {matrix.shape}")
     shaped = bool(found.correction.shape_mm.any())
     limits = limits_of(antenna.actuators, shaped)
     about = _about(antenna, deformation, found, limits, terms)
-    half = rng.standard_normal(((draws + 1) // 2, response.shape[1])) @ response.T
+    half = rng.standard_normal(((draws + 1) // 2, responses[0].shape[1]))
     # in pairs of opposite noise: what is left of a slope at the best place cancels, and the mean is that of the curvature
-    unit = np.concatenate([half, -half])
+    noise = np.concatenate([half, -half])
     mean, high, linear = [], [], []
-    for sigma in sigmas_mm:
+    for sigma, response in zip(sigmas_mm, responses, strict=True):
+        unit = noise @ response.T
         small = bool(sigma * _phase_rms(about, unit) < LINEAR_RAD)
         losses = np.array([_loss(about, limits, sigma * change, small) for change in unit])
         mean.append(losses.mean(axis=0))
@@ -95,11 +96,14 @@ def gain_margin(
 class _About:
     """The true dish under its best correction: where it is, how paths (N, T) follow the map, and the quadratic model there.
 
-    trace: the antenna with other values; climbed (P,): where a climb on linear paths ends without noise; best_dbi (F,).
+    trace: the antenna with other values; base (P,), base_uv (F, 2): the correction, and best_dbi (F,) with it; place: where the model is;
+    climbed (P,): where a climb on linear paths ends from there without noise.
     """
 
     antenna: Antenna
     trace: Tracer
+    base: Array
+    base_uv: Array
     place: Place
     climbed: Array
     aim: Aim
@@ -134,9 +138,10 @@ def _about(antenna: Antenna, deformation: Deformation, found: CorrectionFound, l
     towards = here.direction - np.array([0.0, 0.0, 1.0])
     by_map = (dish.normal * towards).sum(axis=1)[:, None] * zernike_matrix(tuple(terms), x, y)
     mixed = _mixed(place, aim, limits, by_map)
-    best = np.array([_peak_dbi(here, k, uv, aim.free) for k, uv in zip(aim.wavenumbers, place.uv, strict=True)])
+    base, base_uv = found.correction.values[limits.used], found.after_uv
     climbed = climb(linear_tracer(here), aim, limits, place.values, place.uv, fades=False).values
-    about = _About(antenna, trace, place, climbed, aim, by_map, slope, bend, mixed, best)
+    about = _About(antenna, trace, base, base_uv, place, climbed, aim, by_map, slope, bend, mixed, np.zeros(len(wavelengths)))
+    about = replace(about, best_dbi=_given(about, limits, base))
     return replace(about, bend=_stiffened(about, limits))
 
 
@@ -165,7 +170,7 @@ def _stiffened(about: _About, limits: Limits) -> Array:
     for i, (value, way) in enumerate(zip(values, vectors.T, strict=True)):
         step = min(SHIFT, np.sqrt(2 * SHIFT_DB / max(value, 1e-12)))
         with suppress(InputError):
-            both = [_given(about, limits, about.place.values + sign * step * way * scale).mean() for sign in (-1, 1)]
+            both = [_given(about, limits, about.base + sign * step * way * scale).mean() for sign in (-1, 1)]
             more[i] = max((2 * about.best_dbi.mean() - sum(both)) / step**2 - value, 0.0)
     out = about.bend.copy()
     out[:count, :count] += (vectors * more) @ vectors.T / np.outer(scale, scale)
@@ -195,21 +200,21 @@ def _loss(about: _About, limits: Limits, change: Array, small: bool) -> Array:
         slope = (about.slope + about.mixed @ change) * scale
         turned = here.uv.ravel()[: aim.extra]
         step = best_step(slope, convex(about.bend * np.outer(scale, scale), 0.0), limits, here.values, turned, scale, aim.reach)
-        values = here.values + step[:count]
+        moved = step[:count]
     else:
         seen = replace(here.traced, path_mm=here.traced.path_mm + about.by_map @ change)
-        values = here.values + climb(linear_tracer(seen), aim, limits, here.values, here.uv, fades=False).values - about.climbed
-    return about.best_dbi - _given(about, limits, within(about.antenna.actuators, whole(limits, values))[limits.used])
+        moved = climb(linear_tracer(seen), aim, limits, here.values, here.uv, fades=False).values - about.climbed
+    values = within(about.antenna.actuators, whole(limits, about.base + moved))[limits.used]
+    return about.best_dbi - _given(about, limits, values)
 
 
 def _given(about: _About, limits: Limits, values: Array) -> Array:
     """Gain in dB (F,) on the true dish with values (P,) of the actuators, pointed anew where that is free."""
-    here, aim, count = about.place, about.aim, len(limits.used)
-    there = about.trace(whole(limits, values), here.traced)
-    uv = here.uv
+    aim, count, uv = about.aim, len(limits.used), about.base_uv
+    there = about.trace(whole(limits, values), about.place.traced)
     if aim.free:
         # the beam follows the actuators; Newton's method finds its peak from where it went to the first order
-        follow = -np.linalg.solve(about.bend[count:, count:], about.bend[count:, :count] @ (values - here.values))
+        follow = -np.linalg.solve(about.bend[count:, count:], about.bend[count:, :count] @ (values - about.base))
         uv = uv + follow.reshape(-1, 2)
     return np.array([_peak_dbi(there, k, one, aim.free) for k, one in zip(aim.wavenumbers, uv, strict=True)])
 

@@ -117,19 +117,36 @@ def shape_field(targets: TargetValues, reflector: Reflector) -> ShapeField:
     keep = (targets.quality & int(Quality.OFF_SURFACE)) == 0
     if keep.mean() < 1 - LARGEST_LOOSE:
         keep = np.ones(len(keep), dtype=bool)
-    places = targets.places_mm[keep]
+    left_out = tuple(int(i) for i in targets.ids[~keep])
+    values = (targets.value_mm[keep], targets.factor_mm[keep], targets.own_mm2[keep], targets.settled)
+    return _fitted(targets.places_mm[keep], values, reflector.center_mm, reflector.diameter_mm / 2, left_out)
+
+
+def response_to_noise(field: ShapeField, sigma_mm: float) -> Array:
+    """Response (T, N) of the coefficients to the displacements of the field's targets, had each an independent error of sigma_mm.
+
+    The larger the errors, the more they are smoothed away; the true shape is taken as the field's mean.
+    """
+    x, y = ((field.places_mm - field.center_mm) / field.radius_mm).T
+    n = len(field.places_mm)
+    values = (zernike_matrix(field.terms, x, y) @ field.mean_mm, np.zeros((n, 0)), np.full(n, sigma_mm**2), False)
+    return _fitted(field.places_mm, values, field.center_mm, field.radius_mm, ()).response
+
+
+def _fitted(
+    places: Array, of_targets: tuple[Array, Array, Array, bool], center: Array, radius: float, left_out: tuple[int, ...]
+) -> ShapeField:
+    """The field through value, factor and own variances of targets at places, settled or not."""
     spacing = _spacing_mm(places)
-    center, radius = reflector.center_mm, reflector.diameter_mm / 2
     # terms grow steeply beyond their disc, so one is taken that holds all targets
     wide = max(radius, float(np.linalg.norm(places - center, axis=1).max()))
     terms = terms_for(len(places))
-    values = Values((places - center) / wide, targets.value_mm[keep], targets.factor_mm[keep], targets.own_mm2[keep], targets.settled)
+    values = Values((places - center) / wide, *of_targets)
     # matrices of some hundred rows: threads would cost more than they bring, far more on a busy machine
     with threadpool_limits(limits=1, user_api="blas"):
         fit = fit_smooth(values, terms, spacing / wide)
         inner = narrowed(terms, radius / wide) if wide > radius else np.eye(len(terms))
         factor = _factor(inner @ fit.covariance_mm2 @ inner.T)
-    left_out = tuple(int(i) for i in targets.ids[~keep])
     return ShapeField(terms, inner @ fit.mean_mm, factor, center, radius, places, spacing, inner @ fit.response, fit.own_mm, left_out)
 
 
