@@ -11,6 +11,8 @@ import pytest
 from rf_analyses import OFFSET, PRIME, SHAPING, analysis_of, changed
 
 from dishmap.rf.analysis import Change
+from dishmap.rf.correction import correction_of
+from dishmap.rf.limits import value_names
 from dishmap.rf_assumptions import NOT_MODELLED, assumptions
 from dishmap.rf_report import rf_report
 from dishmap.rf_tables import beam_rows, best_fit_rows, brief_rows, budget_rows, correction_rows, gain_rows, mode_rows
@@ -85,6 +87,20 @@ def test_warnings() -> None:
     assert "wins nothing back" in rf_verdict(unsure).headline
 
 
+def test_power_that_a_correction_makes_miss_the_dish() -> None:
+    plain = analysis_of(PRIME)
+    for share, words, warned in (
+        (0.004, "Of the power that met the dish before, 0.4 % now misses it; the gain has that in it.", False),
+        (0.023, "Of the power that met the dish before, 2.3 % now misses it; the gain has that in it.", True),
+        (-0.0061, "The dish receives 0.61 % more power than before.", False),
+        (-0.023, "The dish receives 2.3 % more power than before.", False),
+        (0.0, "As much power meets the dish as before.", False),
+    ):
+        one = changed(plain, corrections={"corrected": replace(plain.corrections["corrected"], lost_share=share)})
+        assert words in rf_report(one, "title", {})
+        assert (f"`corrected`: {words}" in rf_verdict(one).warnings) == warned
+
+
 def test_wrapped_phases_and_broken_beams_are_told() -> None:
     plain = analysis_of(PRIME, correct=False)
     design, measured = plain.states
@@ -125,13 +141,36 @@ def test_correction_table_says_which_limit_is_reached() -> None:
     rigid, shaped = (correction_rows(analysis, name)[1] for name in ("corrected", "shaped"))
     assert [row[0] for row in rigid] == ["shift x", "shift y", "shift z", "tilt x", "tilt y"]
     assert [row[4] for row in rigid] == ["", "", "at its limit", "", ""]
-    assert rigid[2][2:4] == ["0.3000 ± 0.0040", "± 2"]
+    assert rigid[2][2:4] == ["+0.3000 ± 0.0040", "± 2"]
     assert [row[0] for row in shaped[5:]] == [
         "shape, astigmatism sin (2, -2)",
         "shape, defocus (2, 0)",
         "shape, astigmatism cos (2, 2)",
         "shape, farthest point",
     ]
+
+
+def test_correction_table_says_how_far_a_shape_goes_and_which_degrees_it_does_without() -> None:
+    antenna = replace(SHAPING, actuators=replace(SHAPING.actuators, shape_degree=3))
+    found = analysis_of(SHAPING).corrections["shaped"]
+    # defocus of 0.1 mm: 0.1 mm at the middle and at the rim
+    values = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
+    names, units = zip(*value_names(antenna.actuators), strict=True)
+    bent = replace(found, correction=correction_of(values), names=names, units=units)
+    rows = correction_rows(changed(analysis_of(SHAPING), antenna=antenna, corrections={"shaped": bent}, margins={}), "shaped")[1]
+    assert [row[0] for row in rows[5:8]] == ["shape, astigmatism sin (2, -2)", "shape, defocus (2, 0)", "shape, astigmatism cos (2, 2)"]
+    assert rows[8] == ["shape, above degree 2", "mm", "not used", "", ""]
+    assert rows[9] == ["shape, farthest point", "mm", "0.1000", "± 1", ""]
+    assert len(rows) == 10
+
+
+def test_what_a_beam_does_not_have_is_a_dash() -> None:
+    plain = analysis_of(PRIME, correct=False)
+    design, measured = plain.states
+    reading = measured.readings[0]
+    lost = replace(reading, beam=replace(reading.beam, sidelobe_db=(-20.0, float("nan")), width_deg=(float("nan"), 3.0)))
+    row = brief_rows(changed(plain, states=(design, replace(measured, readings=(lost,)))))[1][1]
+    assert row[-2:] == ["- x 3.000", "-20.0, -"]
 
 
 def test_page_needs_no_network_and_escapes() -> None:

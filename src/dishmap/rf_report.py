@@ -20,7 +20,7 @@ from dishmap.rf.shape_field import extrapolated, sigma_at
 from dishmap.rf.state import Reading
 from dishmap.rf_assumptions import NOT_MODELLED, assumptions
 from dishmap.rf_tables import beam_rows, best_fit_rows, budget_rows, by_order, correction_rows, dear_modes, gain_rows, mode_label, mode_rows
-from dishmap.rf_verdict import QUANTITIES, beam_words, highest, rf_verdict, target_sigma_mm, what_moves
+from dishmap.rf_verdict import QUANTITIES, beam_words, highest, light_words, rf_verdict, target_sigma_mm, what_moves
 from dishmap.verdict import number
 
 # The displacement and its sigma are drawn from so many places.
@@ -84,27 +84,33 @@ def _gain(analysis: RfAnalysis) -> str:
 
 
 def _correction(analysis: RfAnalysis) -> str:
-    last = analysis.state([MEASURED, *analysis.corrections][-1])
+    # what moves is drawn as corrected; where only a beam was asked for, as that beam has it
+    beams = [] if analysis.target_beam is None else [BEAM]
+    last = analysis.state([MEASURED, *(analysis.corrections or beams)][-1])
     dish, moved = dish_factor(analysis.antenna, last.deformation), move_factor(analysis.antenna, last.correction)
     who = what_moves(analysis)
     caption = "The antenna along x and along y, sections through the middle of the aperture, projected; rays as designed."
     caption += f" Deformation of the dish drawn {dish:g} times enlarged." if dish else ""
-    caption += f" Blue: the {who} after the correction `{last.name}`, motion drawn {moved:g} times enlarged." if moved else ""
+    larger = "" if moved == 1 else f", motion drawn {moved:g} times enlarged"
+    caption += f" Blue: the {who} in the state `{last.name}`{larger}." if moved else ""
     sides = figure(antenna_sides(analysis.antenna, last.deformation, last.correction), caption, "The antenna from its two sides.")
     about = (
         f"Shift of the {who} in dish axes, after a turn (rotation vector about x and y, right-handed) about its "
         f"{'vertex' if analysis.antenna.subreflector else 'phase centre'}."
     )
     if any(np.any(found.correction.shape_mm) for found in analysis.corrections.values()):
-        about += " Shape: unnormalised Zernike terms of its height along z, over its rim's disc."
+        about += (
+            " Shape: unnormalised Zernike terms of its height along z, over its rim's disc. Values of a bend have no sigma: many bends are "
+            "nearly as good, and another map leads to another of them."
+        )
     parts = []
     for name, found in analysis.corrections.items():
-        told = f"{found.starts} starts, {found.agreeing} of which ended at this one." if found.starts > 1 else ""
+        told = f" {found.starts} starts, {found.agreeing} of which ended at this one." if found.starts > 1 else ""
         parts += [
             f"<h3>{'Rigid pose' if name == 'corrected' else 'Pose and shape'}</h3>",
             table(*correction_rows(analysis, name), (0, 1, 4)),
+            paragraph(light_words(found.lost_share) + told),
         ]
-        parts.append(paragraph(told) if told else "")
     return section("Correction" if analysis.corrections else "Antenna", sides, paragraph(about) if parts else "", *parts)
 
 

@@ -9,8 +9,9 @@ from dishmap.difference_verdict import with_sigma
 from dishmap.rf.analysis import BEAM, DESIGN, RfAnalysis
 from dishmap.rf.best_fit import NAMES
 from dishmap.rf.correct import CorrectionFound
-from dishmap.rf.correction import shape_terms
+from dishmap.rf.correction import bent_degree, shape_terms
 from dishmap.rf.gain import Budget
+from dishmap.rf.limits import farthest_mm
 from dishmap.rf.modes import Mode
 from dishmap.rf.pattern import decibels
 from dishmap.rf.state import Reading, State
@@ -46,7 +47,8 @@ def brief_rows(analysis: RfAnalysis) -> Table:
     rows = []
     for place, state, reading in each_reading(analysis):
         beam = reading.beam
-        widths, lobes = " x ".join(f"{w:.3f}" for w in beam.width_deg), ", ".join(f"{lobe:.1f}" for lobe in beam.sidelobe_db)
+        widths = " x ".join(_plain(width, np.nan, 3) for width in beam.width_deg)
+        lobes = ", ".join(_plain(lobe, np.nan, 1) for lobe in beam.sidelobe_db)
         rows.append([*_gain_cells(analysis, place, state, reading), f"{off_boresight_deg(reading):.3f}", widths, lobes])
     return heads, rows
 
@@ -127,8 +129,9 @@ def best_fit_rows(analysis: RfAnalysis) -> Table:
 
 
 def term_label(term: tuple[int, int]) -> str:
-    """`astigmatism cos (2, 2)`."""
-    return f"{term_name(*term).replace('_', ' ')} ({term[0]}, {term[1]})"
+    """`astigmatism cos (2, 2)`, `term (8, 8)` for one without a name."""
+    name = term_name(*term)
+    return f"{'term' if name.startswith('z_') else name.replace('_', ' ')} ({term[0]}, {term[1]})"
 
 
 def mode_label(n: int, m: int) -> str:
@@ -189,12 +192,15 @@ def correction_rows(analysis: RfAnalysis, name: str) -> Table:
         at = "at its limit" if value_name in found.limits else ""
         told = _with_sigma(value, sigma)
         rows.append([value_name.replace("_", " "), unit, told, f"± {stroke:g}" if stroke else "fixed", at])
-    if np.any(found.correction.shape_mm):
+    degree = bent_degree(moves, found.correction)
+    if degree:
         for term, value, sigma in zip(shape_terms(moves), found.correction.shape_mm, sigmas[len(strokes) :], strict=True):
-            told = _with_sigma(value, sigma)
-            rows.append([f"shape, {term_label(term)}", "mm", told, "", ""])
-        at = "at its limit" if "shape_stroke" in found.limits else ""
-        rows.append(["shape, farthest point", "mm", NONE, f"± {moves.shape_stroke_mm:g}", at])
+            if term[0] <= degree:
+                rows.append([f"shape, {term_label(term)}", "mm", _with_sigma(value, sigma), "", ""])
+        if degree < moves.shape_degree:
+            rows.append([f"shape, above degree {degree}", "mm", "not used", "", ""])
+        farthest, at = farthest_mm(moves, found.correction.shape_mm), "at its limit" if "shape_stroke" in found.limits else ""
+        rows.append(["shape, farthest point", "mm", f"{farthest:.{MM_DECIMALS}f}", f"± {moves.shape_stroke_mm:g}", at])
     return ["actuator", "unit", "value", "stroke", ""], rows
 
 
@@ -216,7 +222,7 @@ def _signed(value: float) -> str:
 
 def _with_sigma(value: float, sigma: float) -> str:
     # the tilt of a feed at the prime focus changes its light, not paths: the map says nothing of it
-    return with_sigma(float(value), float(sigma), "") if sigma > LEAST_SIGMA else _signed(value)
+    return with_sigma(float(value), float(sigma), "", sign=True) if sigma > LEAST_SIGMA else _signed(value)
 
 
 def _plain(value: float, sigma: float, decimals: int) -> str:

@@ -33,6 +33,8 @@ TOLD_SHARE = 0.005
 LOUD_OWN = 3.0
 # Below this many wavelengths across, rays off a subreflector are a coarse picture.
 SMALL_SUB_WAVELENGTHS = 10.0
+# A share of the power that a correction makes miss the dish is told from here on, and stands in the report from the second on.
+MUCH_LIGHT, LEAST_LIGHT = 0.01, 5e-4
 # Of the nodes of the aperture, every so many-th shows the map's sigma well enough.
 EVERY = 7
 # Beyond this loss in dB a beam is in pieces, and gain alone says little.
@@ -46,7 +48,7 @@ def rf_verdict(analysis: RfAnalysis) -> Verdict:
 
 def gain_of(analysis: RfAnalysis, reading: Reading) -> tuple[float, float]:
     """Gain in dBi of a reading, where the pointing has it count, and its sigma (NaN for the design)."""
-    name = "gain_dbi" if analysis.options.pointing == "free" else "boresight_dbi"
+    name = analysis.options.counting
     return float(getattr(reading.beam, name)), float("nan") if reading.spread is None else reading.spread.sigma(name)
 
 
@@ -105,6 +107,15 @@ def beam_words(analysis: RfAnalysis) -> str:
         u, v = beam.directions_uv[0]
         bound, what = "", f"the gain towards θ {np.degrees(np.arcsin(np.hypot(u, v))):.2f}°, φ {np.degrees(np.arctan2(v, u)) % 360:.0f}°"
     return f"Target beam {at}: {what} goes from {beam.before_db:.2f} to {beam.after_db:.2f} dBi{bound}."
+
+
+def light_words(lost_share: float) -> str:
+    """What a correction does to the power that meets the dish, in one sentence."""
+    if abs(lost_share) < LEAST_LIGHT:
+        return "As much power meets the dish as before."
+    if lost_share < 0:
+        return f"The dish receives {-100 * lost_share:.2g} % more power than before."
+    return f"Of the power that met the dish before, {100 * lost_share:.2g} % now misses it; the gain has that in it."
 
 
 def _wins(analysis: RfAnalysis, name: str, place: int) -> str:
@@ -201,6 +212,8 @@ def _correction_warnings(analysis: RfAnalysis) -> Iterator[str]:
         if found.limits:
             what = ", ".join(LIMIT_WORDS.get(limit, limit) for limit in found.limits)
             yield f"`{name}`: the limit is reached of {what}; a longer stroke would win more."
+        if found.lost_share > MUCH_LIGHT:
+            yield f"`{name}`: {light_words(found.lost_share)}"
         if not found.converged:
             yield f"`{name}`: the search for the best correction did not come to rest; there may be a better one."
         if not found.improved:

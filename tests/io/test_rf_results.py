@@ -5,16 +5,17 @@ from __future__ import annotations
 import csv
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rf_analyses import OFFSET, PRIME, SHAPING, analysis_of
+from rf_analyses import OFFSET, PRIME, SHAPING, analysis_of, changed
 
 from dishmap.io.grasp_pattern import parse_cuts, parse_grd
 from dishmap.io.grasp_surface import parse_grid, parse_points, parse_rim
 from dishmap.io.rf_netcdf import parse_netcdf
-from dishmap.io.rf_results import RfProvenance, rf_files, write_rf
+from dishmap.io.rf_results import RfProvenance, gain_table, rf_files, write_rf
 from dishmap.io.rf_surface import deformed_height_mm
 from dishmap.rf.antenna import Antenna
 from dishmap.rf.deformation import Deformation, displacement, undeformed
@@ -73,6 +74,25 @@ def test_summary_and_gain_hold_the_record(files: dict[str, str | bytes]) -> None
     assert (first["name"], float(first["won_back_db"])) == ("defocus", pytest.approx(analysis.modes["measured"][0][0].removed_db, rel=1e-8))
 
 
+def test_loss_counts_where_the_pointing_says() -> None:
+    plain = analysis_of(PRIME, correct=False)
+    fixed = changed(plain, options=replace(plain.options, pointing="fixed"))
+    for analysis, name in ((plain, "gain_dbi"), (fixed, "boresight_dbi")):
+        design, measured = (getattr(state.readings[0].beam, name) for state in analysis.states)
+        assert gain_table(analysis)[1]["loss_db"] == design - measured
+    assert gain_table(fixed)[1]["loss_db"] > gain_table(plain)[1]["loss_db"]
+
+
+def test_a_bend_has_no_sigma_in_any_file() -> None:
+    plain = analysis_of(SHAPING)
+    margin = plain.margins["shaped"]
+    unknown = replace(margin, values_sigma=np.full(len(margin.values_sigma), np.nan))
+    files = rf_files(changed(plain, margins={**plain.margins, "shaped": unknown}), RfProvenance())
+    assert {row["sigma"] for row in rows_of(files, "correction.csv") if row["state"] == "shaped"} == {""}
+    assert "NaN" not in text_of(files, "correction.json") + text_of(files, "summary.json")
+    assert set(json.loads(text_of(files, "summary.json"))["margins"]["shaped"]["values_sigma"]) == {None}
+
+
 def test_correction_has_its_sign_convention(files: dict[str, str | bytes]) -> None:
     found = analysis_of(SHAPING, (15.0, 20.0)).corrections
     content = json.loads(text_of(files, "correction.json"))
@@ -80,6 +100,7 @@ def test_correction_has_its_sign_convention(files: dict[str, str | bytes]) -> No
     for name, one in found.items():
         values = [actuator["value"] for actuator in content["corrections"][name]["actuators"]]
         assert values == one.correction.values.tolist()
+        assert content["corrections"][name]["lost_share"] == one.lost_share
         assert [float(row["value"]) for row in rows_of(files, "correction.csv") if row["state"] == name] == pytest.approx(values)
     head = [line for line in text_of(files, "correction.csv").splitlines() if line.startswith("#")]
     assert any("positive along the axes of the dish" in line for line in head)

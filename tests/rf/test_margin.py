@@ -71,6 +71,9 @@ def test_linear_and_climbed_losses_agree_where_both_hold(monkeypatch) -> None:
     monkeypatch.setattr(margin_module, "LINEAR_RAD", 0.0)
     climbed = gain_margin(SHAPED, TRUTH, found, TERMS, [response()], FACTOR, [0.1], np.random.default_rng(7), 5)
     assert climbed.mean_db[0, 0] == pytest.approx(linear.mean_db[0, 0], rel=SHARE, abs=1e-4)
+    # other maps lead to other bends: no slope at this one tells how far
+    assert found.correction.shape_mm.any()
+    assert np.isnan(linear.values_sigma).all()
 
 
 @pytest.mark.parametrize("antenna", [PRIME, CASSEGRAIN])

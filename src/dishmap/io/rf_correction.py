@@ -51,6 +51,7 @@ def correction_content(analysis: RfAnalysis) -> dict[str, Any]:
             "before_dbi": found.before_dbi.tolist(),
             "after_dbi": found.after_dbi.tolist(),
             "check_db": found.check_db.tolist(),
+            "lost_share": found.lost_share,
             "improved": bool(found.improved),
             "converged": bool(found.converged),
             "starts": int(found.starts),

@@ -113,7 +113,7 @@ def parse_netcdf(data: bytes, source: str = "the NetCDF file") -> tuple[dict[str
 
 
 def grid_variables(states: Sequence[str], frequencies_ghz: Sequence[float], grids: Sequence[Sequence[PatternGrid]]) -> dict[str, Variable]:
-    """Variables of far fields over u and v: one grid for each state (`before`, `after`) and, within it, each frequency.
+    """Variables of far fields over u and v: one grid for each state (`design`, `measured`, ...) and, within it, each frequency.
 
     All have as many directions, and those of one frequency the same ones. Raises InputError when they differ.
     """

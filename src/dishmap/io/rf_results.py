@@ -94,7 +94,7 @@ def _pattern_files(state: State, reading: Reading, polarization: str) -> dict[st
 
 def gain_table(analysis: RfAnalysis) -> list[dict[str, Any]]:
     """Rows of `gain.csv`: every state at every frequency."""
-    design = analysis.states[0].readings
+    design, counting = analysis.states[0].readings, analysis.options.counting
     rows = []
     for state in analysis.states:
         for reading, ideal in zip(state.readings, design, strict=True):
@@ -104,7 +104,7 @@ def gain_table(analysis: RfAnalysis) -> list[dict[str, Any]]:
                 "state": state.name,
                 "frequency_ghz": reading.frequency_ghz,
                 "gain_dbi": beam.gain_dbi,
-                "loss_db": ideal.beam.gain_dbi - beam.gain_dbi,
+                "loss_db": getattr(ideal.beam, counting) - getattr(beam, counting),
                 "ruze_db": reading.path.ruze_db,
                 "weighted_half_path_rms_mm": reading.path.weighted_rms_mm,
                 "half_path_rms_mm": reading.path.rms_mm,

@@ -38,12 +38,13 @@ def antenna_sides(antenna: Antenna, deformation: Deformation, correction: Correc
         _rays(axes, antenna, along)
         if antenna.subreflector is None:
             _horn(axes, antenna, no_correction(antenna), along, INK, "feed")
-            _horn(axes, antenna, _larger(correction, moved), along, BLUE, f"feed, corrected ({_times(moved)})" if moved else "")
+            if moved:
+                _horn(axes, antenna, _larger(correction, moved), along, BLUE, f"feed, moved ({_times(moved)})")
         else:
             _horn(axes, antenna, no_correction(antenna), along, INK, "")
             _sub(axes, antenna, no_correction(antenna), along, INK, "subreflector")
             if moved:
-                _sub(axes, antenna, _larger(correction, moved), along, BLUE, f"subreflector, corrected ({_times(moved)})")
+                _sub(axes, antenna, _larger(correction, moved), along, BLUE, f"subreflector, moved ({_times(moved)})")
         axes.set(xlabel=f"{'xy'[along]} (mm)", ylabel="z (mm)" if along == 0 else "")
     _to_scale(figure, panels)
     handles, labels = figure.axes[0].get_legend_handles_labels()

@@ -56,6 +56,11 @@ class RfOptions:
         if not 2 <= self.draws <= MOST_DRAWS:
             raise InputError(f"the number of draws must lie between 2 and {MOST_DRAWS}, not {self.draws}")
 
+    @property
+    def counting(self) -> str:
+        """The gain of a beam that counts with this pointing: `gain_dbi` at its peak, or `boresight_dbi`."""
+        return "gain_dbi" if self.pointing == "free" else "boresight_dbi"
+
 
 @dataclass(frozen=True)
 class Change:
@@ -188,7 +193,7 @@ class _Run:
 
     def change(self, after: Reading, before: Reading) -> Change:
         """Gain of one reading over another, drawn surface by drawn surface; the design has no spread."""
-        name = "gain_dbi" if self.options.pointing == "free" else "boresight_dbi"
+        name = self.options.counting
         assert after.spread is not None
         drawn = after.spread.of(name) - (getattr(before.beam, name) if before.spread is None else before.spread.of(name))
         low, high = np.percentile(drawn, [2.5, 97.5])

@@ -38,6 +38,11 @@ def shape_terms(actuators: Actuators) -> tuple[tuple[int, int], ...]:
     return tuple(t for t in zernike_terms(actuators.shape_degree) if t[0] > 1) if actuators.shape_degree else ()
 
 
+def bent_degree(actuators: Actuators, correction: Correction) -> int:
+    """The highest degree of the terms into which the subreflector is bent, 0 where it is not."""
+    return max((n for (n, _), size in zip(shape_terms(actuators), correction.shape_mm, strict=True) if size), default=0)
+
+
 def correction_of(values: Array) -> Correction:
     """The correction of a vector (5 + T,) as `Correction.values` gives it."""
     return Correction(values[:3], values[3:5], values[5:])

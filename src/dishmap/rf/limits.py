@@ -69,13 +69,19 @@ def value_names(actuators: Actuators) -> tuple[tuple[str, str], ...]:
     return (*rigid, *((f"shape_{term_name(*term)}", "mm") for term in shape_terms(actuators)))
 
 
+def farthest_mm(actuators: Actuators, shape_mm: Array) -> float:
+    """How far the farthest point of a subreflector's disc is bent, along z, by the terms of its shape (T,)."""
+    terms = shape_terms(actuators)
+    return float(np.abs(_fan(terms, FINE_FAN) @ shape_mm).max()) if terms else 0.0
+
+
 def reached(actuators: Actuators, correction: Correction) -> tuple[str, ...]:
     """Names of limits that a correction has reached, `shape_stroke` for that of the subreflector's shape."""
     scale = np.array([*actuators.shift_mm, *actuators.tilt_deg])
     at = np.abs(correction.values[: len(RIGID)]) >= scale * (1 - REACHED)
     names = [name for name, full, there in zip(RIGID, scale, at, strict=True) if there and full > 0]
-    terms = shape_terms(actuators)
-    if terms and np.abs(_fan(terms, FINE_FAN) @ correction.shape_mm).max() >= actuators.shape_stroke_mm * (1 - 100 * REACHED):
+    stroke = actuators.shape_stroke_mm * (1 - 100 * REACHED)
+    if shape_terms(actuators) and farthest_mm(actuators, correction.shape_mm) >= stroke:
         names.append("shape_stroke")
     return tuple(names)
 
@@ -85,11 +91,9 @@ def within(actuators: Actuators, values: Array) -> Array:
     scale = np.array([*actuators.shift_mm, *actuators.tilt_deg])
     out = values.copy()
     out[: len(RIGID)] = np.clip(out[: len(RIGID)], -scale, scale)
-    terms = shape_terms(actuators)
-    if terms:
-        highest = np.abs(_fan(terms, FINE_FAN) @ out[len(RIGID) :]).max()
-        if highest > actuators.shape_stroke_mm:
-            out[len(RIGID) :] *= actuators.shape_stroke_mm / highest
+    highest = farthest_mm(actuators, out[len(RIGID) :])
+    if highest > actuators.shape_stroke_mm:
+        out[len(RIGID) :] *= actuators.shape_stroke_mm / highest
     return out
 
 

@@ -43,7 +43,8 @@ class Margin:
     """Loss of gain in dB against the correction made from the truth, for S sigmas of each target and F frequencies.
 
     mean_db, high_db (S, F): mean and 90th percentile over draws; linear (S,): whether the linear response was used. values_sigma (P,): what
-    the map's own covariance does to all values of the correction, in their units; 0 for those that a limit holds or that do not move.
+    the map's own covariance does to all values of a rigid correction, in their units; 0 for those that a limit holds or that do not move.
+    NaN for a bend: many of them are nearly as good, and another map leads to another one, farther off than slopes at this one say.
     """
 
     sigma_mm: Array
@@ -88,7 +89,7 @@ def gain_margin(
         mean.append(losses.mean(axis=0))
         high.append(np.percentile(losses, 90, axis=0))
         linear.append(small)
-    own = _values_sigma(about, limits, factor_mm)
+    own = np.full(limits.size, np.nan) if shaped else _values_sigma(about, limits, factor_mm)
     return Margin(np.array(sigmas_mm, float), found.frequencies_ghz, np.array(mean), np.array(high), np.array(linear), own)
 
 
@@ -146,7 +147,7 @@ def _about(antenna: Antenna, deformation: Deformation, found: CorrectionFound, l
 
 
 def _values_sigma(about: _About, limits: Limits, factor_mm: Array) -> Array:
-    """Standard deviations (P of the whole vector) of the values that maps with this factor (T, R) of their covariance ask for."""
+    """Standard deviations (P, of the whole vector) of the values that maps with this factor (T, R) of their covariance ask for."""
     count = len(limits.used)
     free = np.ones(len(about.bend), bool)
     free[:count] = np.abs(about.place.values) <= (1 - HELD) * limits.scale
