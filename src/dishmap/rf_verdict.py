@@ -35,6 +35,8 @@ LOUD_OWN = 3.0
 SMALL_SUB_WAVELENGTHS = 10.0
 # A share of the power that a correction makes miss the dish is told from here on, and stands in the report from the second on.
 MUCH_LIGHT, LEAST_LIGHT = 0.01, 5e-4
+# A mask that is missed by less is kept.
+LEAST_MISSED_DB = 0.005
 # Of the nodes of the aperture, every so many-th shows the map's sigma well enough.
 EVERY = 7
 # Beyond this loss in dB a beam is in pieces, and gain alone says little.
@@ -99,7 +101,8 @@ def beam_words(analysis: RfAnalysis) -> str:
     at = f"at {beam.frequency_ghz:g} GHz"
     if isinstance(goal, Mask):
         kept = "is kept" if beam.met else f"is missed by {-beam.after_db:.2f} dB at worst"
-        return f"Target beam {at}: the mask {kept} ({-beam.before_db:.2f} dB before)."
+        before = f"missed by {-beam.before_db:.2f} dB" if beam.before_db < -LEAST_MISSED_DB else "kept as well"
+        return f"Target beam {at}: the mask {kept} (before: {before})."
     if isinstance(goal, Broaden):
         bound = f"; no antenna could pass {beam.bound_dbi:.1f} dBi"
         what = f"the lowest gain within {goal.radius_deg:g}° of the boresight"

@@ -20,7 +20,7 @@ from dishmap.errors import InputError
 from dishmap.io.antenna_file import format_antenna
 from dishmap.io.difference_map_file import write_difference_map
 from dishmap.io.grasp_pattern import read_grd
-from dishmap.rf.antenna import Antenna, Feed, Reflector, Subreflector
+from dishmap.rf.antenna import Actuators, Antenna, Feed, Reflector, Subreflector
 from dishmap.rf.goals import Broaden, Mask, Steer
 from dishmap.targets.pattern import Pattern
 
@@ -95,7 +95,9 @@ def test_figures_agree_everywhere(corrected: tuple[Path, Result]) -> None:
     assert 20 * np.log10(np.nanmax(np.abs(grid.co))) == pytest.approx(gains["corrected"], abs=0.05)
     shift = next(one for one in summary["corrections"]["corrected"]["actuators"] if one["name"] == "shift_z")
     assert abs(shift["value"]) > 0.1
-    assert re.search(rf"shift z +mm +{re.escape(format(shift['value'], '+.4f'))} ", done.stdout)
+    told = re.search(r"shift z +mm +([+-]\d+\.(\d+)) ± ", done.stdout)
+    assert told is not None
+    assert float(told[1]) == pytest.approx(shift["value"], abs=0.51 * 10 ** -len(told[2]))
     assert summary["inputs"]["shape"]["path"].endswith("difference.npz")
 
 
@@ -139,6 +141,15 @@ def test_bad_input(place: Path, tmp_path: Path) -> None:
     assert "steer:THETA,PHI" in refused(rf(place, "prime", out, "--target-beam", "wide"))
     assert "cannot read the mask" in refused(rf(place, "prime", out, "--target-beam", "mask:none.csv"))
     assert "names 15 GHz twice" in refused(rf(place, "prime", out, ghz=(15, 20, 15)))
+    assert "beyond 3000 GHz; frequencies are in GHz" in refused(rf(place, "prime", out, ghz=(15, 12500)))
+    still = replace(PRIME, actuators=Actuators((0.0, 0.0, 0.0), (0.0, 0.0)))
+    (place / "still.toml").write_text(format_antenna(still))
+    assert "needs something that moves" in refused(rf(place, "still", out, "--target-beam", "steer:1,0"))
+    for option in ("--camera", "--pattern"):
+        assert f"{option} is for a map" in refused(rf(place, "prime", out, option, place / "prime.toml"))
+    before = sorted(path.name for path in (place / "change").iterdir())
+    assert "give another folder" in refused(rf(place, "prime", place / "plate" / ".." / "change"))
+    assert sorted(path.name for path in (place / "change").iterdir()) == before
     assert not out.exists()
 
 

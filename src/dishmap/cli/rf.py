@@ -15,10 +15,13 @@ from dishmap.errors import InputError
 
 if TYPE_CHECKING:
     from dishmap.rf.analysis import RfAnalysis
+    from dishmap.rf.antenna import Antenna
     from dishmap.rf.goals import Goal
 
 FREQUENCY = "--frequency-ghz"
 REPORT = "report.html"
+# What is beyond was typed in another unit.
+HIGHEST_GHZ = 3000.0
 
 
 class SeveralNumbers(click.Command):
@@ -99,6 +102,9 @@ def rf_command(shape: Path, antenna_file: Path, out: Path, **given: Any) -> None
     options = RfOptions(frequencies_of(given["frequencies"]), given["correct"], given["pointing"], goal_of(given["target_beam"]))
     quantity = quantity_of(shape_file(shape), given["whole_motion"])
     camera_file, pattern_file = given["camera_file"], given["pattern_file"]
+    check_asked(antenna, options.goal is not None, quantity, {"--camera": camera_file, "--pattern": pattern_file})
+    if out.resolve() == shape_file(shape).parent.resolve():
+        raise InputError(f"--out {out} is the folder of the shape, whose own report and summary would be lost; give another folder")
     camera = None if camera_file is None else read_camera(camera_file)
     pattern = None if pattern_file is None else read_pattern(pattern_file)
     field = read_shape_field(shape, antenna.reflector, "shape" if quantity == "surface" else quantity, camera, pattern)
@@ -114,9 +120,21 @@ def rf_command(shape: Path, antenna_file: Path, out: Path, **given: Any) -> None
     print_analysis(analysis, title_of(shape), out)
 
 
+def check_asked(antenna: Antenna, beam: bool, quantity: str, of_maps: dict[str, Path | None]) -> None:
+    """Raises InputError for a beam to make without anything that moves, and for files that only a map needs beside a difference."""
+    moves = antenna.actuators
+    if beam and not any((*moves.shift_mm, *moves.tilt_deg, moves.shape_degree)):
+        raise InputError("--target-beam needs something that moves, and all strokes in [actuators] are 0; give some, or leave it out")
+    named = next((option for option, path in of_maps.items() if path is not None), None)
+    if named is not None and quantity != "surface":
+        raise InputError(f"{named} is for a map of `dishmap map`, and the shape is a difference, which needs none; leave it out")
+
+
 def frequencies_of(given: tuple[list[float], ...]) -> tuple[float, ...]:
-    """All frequencies, as given. Raises InputError for one that is given twice."""
+    """All frequencies, as given. Raises InputError for one that is given twice, or in another unit."""
     frequencies = tuple(frequency for some in given for frequency in some)
+    if max(frequencies) > HIGHEST_GHZ:
+        raise InputError(f"{FREQUENCY} {max(frequencies):g} is beyond {HIGHEST_GHZ:g} GHz; frequencies are in GHz, not in MHz or Hz")
     twice = next((f for f in frequencies if frequencies.count(f) > 1), None)
     if twice is not None:
         raise InputError(f"{FREQUENCY} names {twice:g} GHz twice; name each frequency once")

@@ -22,7 +22,8 @@ STYLES: dict[str, dict[str, Any]] = {
     "corrected": {"color": BLUE, "linestyle": "-", "linewidth": 1.6},
     "shaped": {"color": GREEN, "linestyle": (0, (6, 1, 1, 1)), "linewidth": 1.6},
 }
-OTHER_STYLE: dict[str, Any] = {"color": PURPLE, "linestyle": (0, (1, 1)), "linewidth": 1.6}
+# dots are for what is cross-polar
+OTHER_STYLE: dict[str, Any] = {"color": PURPLE, "linestyle": (0, (3, 1, 1, 1, 1, 1)), "linewidth": 1.6}
 CUT_PANEL_IN, PATTERN_PANEL_IN, BAR_IN = (5.2, 3.3), 3.3, 1.2
 CURVE_IN = (7.4, 4.4)
 # Patterns are drawn from so many dB below their highest peak.

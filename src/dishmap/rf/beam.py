@@ -149,7 +149,7 @@ def _coarse_peak(sources: Sources, wavelength_mm: float, unit: float, polarizati
     if {int(row), int(column)} & {0, len(side) - 1}:
         raise FitError(
             f"the strongest direction lies {np.degrees(reach):.3g} degrees or more from the boresight; "
-            "the deformation tilts or scatters the beam beyond what is looked at"
+            "the deformation tilts or scatters the beam beyond what is looked at, or nothing of the aperture is left free"
         )
     cross = float(decibels(np.nanmax(np.abs(grid.cross) ** 2)))
     return float(side[column]), float(side[row]), cross

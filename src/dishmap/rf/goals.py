@@ -68,7 +68,7 @@ def directions(goal: Goal, reach: float) -> Array:
     if not (np.hypot(*uv.T) <= reach).all():
         asked, most = (float(np.degrees(np.arcsin(min(s, 1.0)))) for s in (np.hypot(*uv.T).max(), reach))
         raise InputError(
-            f"the goal reaches {asked:.3g} degrees from the boresight, but a subreflector shapes beams within {most:.3g} degrees "
+            f"the goal reaches {asked:.3g} degrees from the boresight, but the actuators shape beams within {most:.3g} degrees "
             "(five times wavelength over diameter); ask for less, or a lower frequency"
         )
     return uv
