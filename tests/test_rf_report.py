@@ -123,6 +123,13 @@ def test_fixed_pointing_counts_on_the_boresight() -> None:
     assert "boresight" in assumptions(fixed)[2]
 
 
+def test_what_a_bend_is_asked_for_is_said_where_there_is_one() -> None:
+    assert any("held as designed" in words for words in assumptions(analysis_of(SHAPING)))
+    assert not any("held as designed" in words for words in assumptions(analysis_of(PRIME)))
+    assert "That of a bend is rough" in rf_report(analysis_of(SHAPING), "title", {})
+    assert "That of a bend is rough" not in rf_report(analysis_of(PRIME), "title", {})
+
+
 def test_tables_hold_every_state_and_frequency() -> None:
     analysis = analysis_of(SHAPING, (15.0, 20.0))
     wanted = [[f, s] for f in ("15", "20") for s in ("design", "measured", "corrected", "shaped")]
@@ -133,7 +140,10 @@ def test_tables_hold_every_state_and_frequency() -> None:
     gain = analysis.states[1].readings[1].beam.gain_dbi
     assert gain_rows(analysis)[1][5][2].startswith(f"{gain:.2f}")
     assert float(best_fit_rows(analysis)[1][5][2].split()[0]) == pytest.approx(analysis.best_fit.values[5], abs=0.01)
-    assert [row[0] for row in mode_rows(analysis, 0, 2)[1]] == ["defocus (2, 0)", "astigmatism (2, 2)"]
+    heads, rows = mode_rows(analysis, 0, 2)
+    assert (heads.count("alone (dB)"), heads.count("won back (dB)")) == (1, 3)
+    assert {len(row) for row in rows} == {len(heads)}
+    assert [row[0] for row in rows] == ["defocus (2, 0)", "astigmatism (2, 2)"]
 
 
 def test_correction_table_says_which_limit_is_reached() -> None:

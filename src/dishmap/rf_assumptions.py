@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dishmap.rf.analysis import RfAnalysis
+from dishmap.rf.analysis import SHAPED, RfAnalysis
 from dishmap.rf.antenna import Antenna
 from dishmap.rf_verdict import QUANTITIES, what_moves
 
@@ -41,6 +41,11 @@ def assumptions(analysis: RfAnalysis) -> list[str]:
         out.append(
             f"Corrections hold the {what_moves(analysis)} within its strokes and serve all frequencies at once: the mean gain in dB is "
             f"largest."
+        )
+    if SHAPED in analysis.corrections:
+        out.append(
+            "A bend is asked to correct phases: it is sought with the illumination held as designed, degree by degree. Of all bends found "
+            "and the rigid pose, the one with the largest gain is taken."
         )
     return out
 

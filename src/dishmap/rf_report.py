@@ -13,7 +13,7 @@ from dishmap.plot.rf_bars import margin_curves, mode_bars
 from dishmap.plot.rf_maps import aperture_maps, sigma_field
 from dishmap.plot.rf_pattern import gain_curves, pattern_cuts, pattern_maps
 from dishmap.report import inputs_section
-from dishmap.rf.analysis import BEAM, MEASURED, RfAnalysis
+from dishmap.rf.analysis import BEAM, MEASURED, SHAPED, RfAnalysis
 from dishmap.rf.aperture import spread_evenly
 from dishmap.rf.deformation import displacement
 from dishmap.rf.shape_field import extrapolated, sigma_at
@@ -153,11 +153,12 @@ def _margin(analysis: RfAnalysis) -> str:
     if not analysis.margins:
         return ""
     curves = {name: (margin.sigma_mm, margin.mean_db.mean(axis=1)) for name, margin in analysis.margins.items()}
+    rough = " That of a bend is rough: many bends are nearly as good, and the one found is not the very best." if SHAPED in curves else ""
     chart = figure(
         margin_curves(curves, target_sigma_mm(analysis)),
         "What a correction leaves on the table because it was made from a map with this much noise of each target: mean over maps and "
         "over the "
-        "frequencies asked for. Dashed: the median sigma of this map at its targets.",
+        f"frequencies asked for. Dashed: the median sigma of this map at its targets.{rough}",
         "Curves of gain left against the noise of the map.",
     )
     return section("How good must the map be?", chart)

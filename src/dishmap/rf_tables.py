@@ -158,14 +158,16 @@ def mode_rows(analysis: RfAnalysis, place: int, most: int) -> Table:
     names = list(analysis.modes)
     heads = ["mode (n, m)"]
     for name in names:
-        heads += [f"{name}: size (mm)", "towards (°)", "alone (dB)", "won back (dB)"]
+        # what each costs alone is told of the first state only: a page is no wider
+        heads += [f"{name}: size (mm)", "towards (°)", *(["alone (dB)"] if name == names[0] else []), "won back (dB)"]
     rows = []
     for first in dear_modes(analysis, place, most):
         cells = [mode_label(first.n, first.m)]
         for name in names:
             mode = by_order(analysis, name, place)[first.n, first.m]
             cells += [_plain(mode.amplitude_mm, float("nan"), MM_DECIMALS), f"{round(mode.orientation_deg) + 0}" if mode.m else NONE]
-            cells += [_plain(value, float("nan"), DB_DECIMALS) for value in (mode.alone_db, mode.removed_db)]
+            costs = (mode.alone_db, mode.removed_db) if name == names[0] else (mode.removed_db,)
+            cells += [_plain(value, float("nan"), DB_DECIMALS) for value in costs]
         rows.append(cells)
     return heads, rows
 
