@@ -89,7 +89,7 @@ ORDER = [
     *("sheet.seams", "sheet.gores", "sheet.markers"),
     *("sheet.boards", "sheet.paper", "sheet.tiles", "sheet.layout", "sheet.printed", "sheet.sheets"),
     # files
-    *("io.atomic", "io.image_header", "io.images", "io.picture_file", "io.pose_file", "io.camera_formats", "io.camera_file"),
+    *("io.atomic", "io.archive", "io.image_header", "io.images", "io.picture_file", "io.pose_file", "io.camera_formats", "io.camera_file"),
     "io.pattern_file",
     *("io.toml_file", "io.csv_table"),
     *("io.scenario_pattern", "io.scenario_file", "io.truth_file", "io.points_file", "io.measurement_file", "io.results"),

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from dishmap.difference.difference_map import Significance
 from dishmap.difference.saved import SavedDifference, saved_difference
 from dishmap.errors import InputError
+from dishmap.io.archive import HEADER
 from dishmap.io.difference_map_file import (
-    HEADER,
     REAL,
     WHOLE,
     difference_bytes,

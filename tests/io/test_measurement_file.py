@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from dishmap.camera.model import Camera
 from dishmap.errors import InputError
+from dishmap.io.archive import HEADER
 from dishmap.io.measurement_file import (
-    HEADER,
     REAL,
     WHOLE,
     is_measurement,

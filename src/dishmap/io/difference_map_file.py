@@ -6,10 +6,6 @@ and what is common to all targets. `difference.csv` holds the same values for pe
 
 from __future__ import annotations
 
-import io
-import json
-import os
-import zipfile
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,6 +16,7 @@ from numpy.typing import NDArray
 from dishmap.difference.difference_map import Significance
 from dishmap.difference.saved import SavedDifference
 from dishmap.errors import InputError
+from dishmap.io.archive import archive_bytes, archive_file, finite, reason_of, unpacked
 from dishmap.io.atomic import write_bytes
 from dishmap.quality import Quality
 from dishmap.targets.pattern import Surface
@@ -29,14 +26,9 @@ Array = NDArray[Any]
 
 DIFFERENCE_FILE = "difference.npz"
 FORMAT = "dishmap-difference-map/1"
-HEADER = "header"
-AGAIN = "make it again with `dishmap diff`"
+WHAT, AGAIN = "difference", "make it again with `dishmap diff`"
 # Within which the header's first key stands.
 BEGINNING_BYTES = 1024
-# 10,000 targets with 300 columns take 50 MB.
-LARGEST_FILE_BYTES = 200_000_000
-# What an archive may unpack to, relative to its size: arrays are stored as they are, so there is only the header of the archive.
-LARGEST_UNPACKED = 1.5
 # Columns: name -> shape of one target's value; None: any number.
 WHOLE = {"ids": (), "quality": ()}
 REAL: dict[str, tuple[int | None, ...]] = {
@@ -64,11 +56,7 @@ def difference_bytes(saved: SavedDifference) -> bytes:
         "significance": {name: float(value) for name, value in asdict(saved.significance).items()},
         "converged": bool(saved.converged),
     }
-    whole = {name: np.asarray(getattr(saved, name), dtype="<i8") for name in WHOLE}
-    real = {name: np.asarray(getattr(saved, name), dtype="<f8") for name in REAL}
-    out = io.BytesIO()
-    np.savez(out, **{HEADER: np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)}, **whole, **real)  # type: ignore[arg-type]
-    return out.getvalue()
+    return archive_bytes(header, {name: getattr(saved, name) for name in WHOLE}, {name: getattr(saved, name) for name in REAL})
 
 
 def write_difference_map(path: str | Path, saved: SavedDifference) -> None:
@@ -88,39 +76,16 @@ def is_difference_map(path: str | Path) -> bool:
 
 def read_difference_map(path: str | Path) -> SavedDifference:
     """Read `difference.npz`. Raises InputError, in one sentence, for a file that is no such difference or is damaged."""
-    try:
-        if os.path.getsize(path) > LARGEST_FILE_BYTES:
-            raise InputError(f"{path} is larger than {LARGEST_FILE_BYTES // 10**6} MB, so it is no difference")
-        data = Path(path).read_bytes()
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot read the difference {path}: {getattr(error, 'strerror', None) or error}") from error
-    return parse_difference_map(data, str(path))
+    return parse_difference_map(archive_file(path, WHAT), str(path))
 
 
 def parse_difference_map(data: bytes, source: str = "the difference") -> SavedDifference:
     """Make a SavedDifference of the bytes of a file; `source` stands in messages. Raises InputError."""
-    try:
-        arrays = _arrays(data)
-        header = json.loads(bytes(arrays.pop(HEADER).astype(np.uint8)).decode())
-        found = header["format"]
-    except (zipfile.BadZipFile, OSError, ValueError, KeyError, TypeError, EOFError, RecursionError, NotImplementedError) as error:
-        raise InputError(f"{source} is no whole difference of dishmap; {AGAIN}") from error
-    if found != FORMAT:
-        raise InputError(f"{source} has the format {str(found)[:40]!r}, and {FORMAT!r} is read; {AGAIN}")
+    header, arrays = unpacked(data, source, WHAT, FORMAT, AGAIN)
     try:
         return _saved(header, arrays)
     except (InputError, ValueError, KeyError, TypeError, IndexError, OverflowError, AttributeError) as error:
-        reason = f"{error} is missing" if isinstance(error, KeyError) else " ".join(str(error).split())[:100]
-        raise InputError(f"{source} is damaged ({reason}); {AGAIN}") from error
-
-
-def _arrays(data: bytes) -> dict[str, Array]:
-    """All arrays of an archive, without unpacking more than is in it."""
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        if sum(item.file_size for item in archive.infolist()) > LARGEST_UNPACKED * len(data):
-            raise ValueError("it unpacks to more than it holds")
-    with np.load(io.BytesIO(data), allow_pickle=False) as loaded:
-        return {name: loaded[name] for name in loaded.files}
+        raise InputError(f"{source} is damaged ({reason_of(error)}); {AGAIN}") from error
 
 
 def _saved(header: dict[str, Any], arrays: dict[str, Array]) -> SavedDifference:
@@ -131,16 +96,14 @@ def _saved(header: dict[str, Any], arrays: dict[str, Array]) -> SavedDifference:
         raise InputError("the covariance of the rigid motion is none")
     if not isinstance(header["converged"], bool):
         raise InputError("converged must be true or false")
-    sizes: dict[str, Any] = {
-        name: value if name == "kind" or value is None else _number(value) for name, value in header["surface"].items()
-    }
+    sizes: dict[str, Any] = {name: value if name == "kind" or value is None else finite(value) for name, value in header["surface"].items()}
     return SavedDifference(
         **columns,
         surface=Surface(**sizes),
         rigid_motion=Pose(np.asarray(motion["rotation"], dtype=float), np.asarray(motion["mm"], dtype=float)),
         rigid_covariance=covariance,
         significance=Significance(
-            _number(significance["chi_square"]), int(_number(significance["degrees"])), _number(significance["p_value"])
+            finite(significance["chi_square"]), int(finite(significance["degrees"])), finite(significance["p_value"])
         ),
         converged=header["converged"],
     )
@@ -169,10 +132,3 @@ def _columns(arrays: dict[str, Array]) -> dict[str, Array]:
     if (out["quality"] & ~sum(int(bit) for bit in Quality)).any():
         raise InputError("a quality flag is unknown")
     return out
-
-
-def _number(value: Any) -> float:
-    number = float(value)
-    if not np.isfinite(number):
-        raise InputError("a number is not finite")
-    return number

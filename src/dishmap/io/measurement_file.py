@@ -7,10 +7,6 @@ is common to all targets, and fingerprints of camera and pattern, so that a meas
 from __future__ import annotations
 
 import hashlib
-import io
-import json
-import os
-import zipfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +16,7 @@ from numpy.typing import NDArray
 
 from dishmap.camera.model import Camera
 from dishmap.errors import InputError
+from dishmap.io.archive import archive_bytes, archive_file, finite, reason_of, unpacked
 from dishmap.io.atomic import write_bytes
 from dishmap.io.pattern_file import format_pattern
 from dishmap.quality import Quality
@@ -32,11 +29,7 @@ Array = NDArray[Any]
 
 MEASUREMENT_FILE = "measurement.npz"
 FORMAT = "dishmap-measurement/1"
-HEADER = "header"
-# 10,000 targets take 30 MB.
-LARGEST_FILE_BYTES = 200_000_000
-# What an archive may unpack to, relative to its size: arrays are stored as they are, so there is only the header of the archive.
-LARGEST_UNPACKED = 1.5
+WHAT, AGAIN = "measurement", "make it again with `dishmap map`"
 MAGIC = b"PK\x03\x04"
 # Columns: name -> shape of one target's value; `P` stands for the number of the camera's parameters.
 WHOLE = {"index": (), "ids": (), "quality": ()}
@@ -97,11 +90,7 @@ def measurement_bytes(poses: TargetPoses, camera: Camera, pattern: Pattern, phot
         "rejected": [[int(ident), str(why)] for ident, why in poses.rejected],
         "sheet": None if poses.sheet is None else {name: float(value) for name, value in asdict(poses.sheet).items()},
     }
-    whole = {name: np.asarray(getattr(poses, name), dtype="<i8") for name in WHOLE}
-    real = {name: np.asarray(getattr(poses, name), dtype="<f8") for name in REAL}
-    out = io.BytesIO()
-    np.savez(out, **{HEADER: np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)}, **whole, **real)  # type: ignore[arg-type]
-    return out.getvalue()
+    return archive_bytes(header, {name: getattr(poses, name) for name in WHOLE}, {name: getattr(poses, name) for name in REAL})
 
 
 def write_measurement(path: str | Path, poses: TargetPoses, camera: Camera, pattern: Pattern) -> None:
@@ -123,40 +112,21 @@ def read_measurement(path: str | Path, camera: Camera, pattern: Pattern) -> Meas
 
     Raises InputError, in one sentence, for a file that is no measurement, is damaged, or belongs to another camera or pattern.
     """
-    try:
-        if os.path.getsize(path) > LARGEST_FILE_BYTES:
-            raise InputError(f"{path} is larger than {LARGEST_FILE_BYTES // 10**6} MB, so it is no measurement")
-        data = Path(path).read_bytes()
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot read the measurement {path}: {getattr(error, 'strerror', None) or error}") from error
-    return parse_measurement(data, camera, pattern, str(path))
+    return parse_measurement(archive_file(path, WHAT), camera, pattern, str(path))
 
 
 def parse_measurement(data: bytes, camera: Camera, pattern: Pattern, source: str = "the measurement") -> Measurement:
     """Make a Measurement of the bytes of a file; `source` stands in messages. Raises InputError."""
+    header, arrays = unpacked(data, source, WHAT, FORMAT, AGAIN)
     try:
-        arrays = _arrays(data)
-        header = json.loads(bytes(arrays.pop(HEADER).astype(np.uint8)).decode())
-        found = header["format"]
         digests = {name: str(header[f"{name}_sha256"]) for name in ("camera", "pattern", "photograph")}
-    except (zipfile.BadZipFile, OSError, ValueError, KeyError, TypeError, EOFError, RecursionError, NotImplementedError) as error:
-        raise InputError(f"{source} is no whole measurement of dishmap; make it again with `dishmap map`") from error
-    if found != FORMAT:
-        raise InputError(f"{source} has the format {str(found)[:40]!r}, and {FORMAT!r} is read; make it again with `dishmap map`")
+    except KeyError as error:
+        raise InputError(f"{source} is no whole {WHAT} of dishmap; {AGAIN}") from error
     _check_made_with(digests, camera, pattern, source)
     try:
         return Measurement(_poses(header, arrays, camera, pattern), digests["photograph"])
     except (InputError, ValueError, KeyError, TypeError, IndexError, OverflowError) as error:
-        raise InputError(f"{source} is damaged ({_reason(error)}); make it again with `dishmap map`") from error
-
-
-def _arrays(data: bytes) -> dict[str, Array]:
-    """All arrays of an archive, without unpacking more than is in it."""
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        if sum(item.file_size for item in archive.infolist()) > LARGEST_UNPACKED * len(data):
-            raise ValueError("it unpacks to more than it holds")
-    with np.load(io.BytesIO(data), allow_pickle=False) as loaded:
-        return {name: loaded[name] for name in loaded.files}
+        raise InputError(f"{source} is damaged ({reason_of(error)}); {AGAIN}") from error
 
 
 def _check_made_with(digests: dict[str, str], camera: Camera, pattern: Pattern, source: str) -> None:
@@ -181,20 +151,20 @@ def _poses(header: dict[str, Any], arrays: dict[str, Array], camera: Camera, pat
         columns[name] = values.astype(np.int64 if kind == "i" else float)
     _check_columns(columns, pattern)
     pose = header["camera_from_dish"]
-    base, slope, inflation = (_number(value) for value in header["noise"])
+    base, slope, inflation = (finite(value) for value in header["noise"])
     return TargetPoses(
         **columns,
         camera_from_dish=Pose(np.asarray(pose["rotation"], dtype=float), np.asarray(pose["mm"], dtype=float)),
-        normal_sigma_rad=_number(header["normal_sigma_rad"]),
+        normal_sigma_rad=finite(header["normal_sigma_rad"]),
         noise_model=NoiseModel(base, slope, inflation),
-        log_gamma=_number(header["log_gamma"]),
+        log_gamma=finite(header["log_gamma"]),
         rejected=tuple((int(ident), str(why)) for ident, why in header["rejected"]),
         sheet=_sheet(header["sheet"]),
     )
 
 
 def _sheet(content: dict[str, Any] | None) -> SheetSummary | None:
-    return None if content is None else SheetSummary(**{name: _number(value) for name, value in content.items()})
+    return None if content is None else SheetSummary(**{name: finite(value) for name, value in content.items()})
 
 
 def _check_columns(columns: dict[str, Array], pattern: Pattern) -> None:
@@ -215,14 +185,3 @@ def _check_columns(columns: dict[str, Array], pattern: Pattern) -> None:
         unit = matrix / np.maximum(scale[:, :, None] * scale[:, None, :], np.finfo(float).tiny)
         if np.abs(unit - np.swapaxes(unit, 1, 2)).max() > ROUNDING or np.linalg.eigvalsh(unit).min() < -ROUNDING:
             raise InputError(f"{name} is no covariance")
-
-
-def _number(value: Any) -> float:
-    number = float(value)
-    if not np.isfinite(number):
-        raise InputError("a number is not finite")
-    return number
-
-
-def _reason(error: Exception) -> str:
-    return f"{error} is missing" if isinstance(error, KeyError) else " ".join(str(error).split())[:100]
