@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from dishmap.plot.canvas import DIVERGING, INK, SEQUENTIAL, Array, as_svg, color_norm
-from dishmap.plot.maps import dish_axes, map_figure, plain_ticks
+from dishmap.plot.maps import dish_axes, plain_ticks
 
 Bools = NDArray[np.bool_]
 
@@ -51,7 +51,9 @@ def aperture_maps(
 @as_svg
 def sigma_field(xy_mm: Array, sigma_mm: Array, beyond: Bools, targets_mm: Array, center_mm: Array, radius_mm: float, label: str) -> Figure:
     """Sigmas (N,) at places (N, 2) of an aperture, hatched where they are extrapolated (`beyond` (N,)), and targets (T, 2) as dots."""
-    figure, axes = map_figure(xy_mm)
+    # as large as one panel of `aperture_maps`, beside which it stands
+    figure = Figure(figsize=(PANEL_IN + BAR_IN, PANEL_IN + 0.5), layout="compressed")
+    axes = figure.subplots()
     norm = color_norm(sigma_mm)
     _field(axes, _raster(xy_mm, sigma_mm, center_mm, radius_mm), center_mm, radius_mm, norm, SEQUENTIAL)
     _hatch(axes, _raster(xy_mm, beyond.astype(float), center_mm, radius_mm), center_mm, radius_mm)
