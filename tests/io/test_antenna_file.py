@@ -140,7 +140,8 @@ def antennas(draw: st.DrawFn) -> Antenna:
     # an ellipsoid fits every dish
     sub = draw(st.none() | st.builds(Subreflector, st.just("gregorian"), lengths, st.floats(1.01, 1000), st.none() | lengths))
     struts = draw(st.integers(0, 12))
-    shade = Blockage(draw(st.none() | lengths), struts, draw(lengths) if struts else 0.0, draw(st.floats(-360, 360)))
+    narrow = st.floats(1e-3, 0.99 * diameter)
+    shade = Blockage(draw(st.none() | narrow), struts, draw(narrow) if struts else 0.0, draw(st.floats(-360, 360)))
     degree = draw(st.sampled_from([0, 2, 12])) if sub else 0
     tilt = st.floats(0, 30)
     moves = Actuators(draw(st.tuples(lengths, lengths, lengths)), draw(st.tuples(tilt, tilt)), degree, draw(lengths) if degree else 0.0)
@@ -160,6 +161,7 @@ def test_any_antenna_reads_back_equal(antenna: Antenna) -> None:
             "diameter_m = 0.6",
             r"^dish\.toml: unknown key 'diameter_m' in reflector; the nearest valid one is 'diameter_mm'",
         ),
+        ("strut_width_mm = 4", "strut_width_mm = 600", "a blocked strut of 600 mm leaves nothing of an aperture of 600 mm"),
         ("[feed]", "[fed]", r"unknown key 'fed' in the file; the nearest valid one is 'feed' \(all: format, reflector"),
         ("focal_length_mm = 300", "", "^dish.toml: reflector lacks the key 'focal_length_mm'$"),
         ("diameter_mm = 600", "diameter_mm = 0.6", "diameter_mm = 0.6 is no dish between 30 mm and 100 m; .* so 0.6 m is 600$"),

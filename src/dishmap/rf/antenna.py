@@ -200,6 +200,11 @@ class Antenna:
         if self.subreflector is None and self.actuators.shape_degree:
             raise InputError("shape_degree needs a subreflector: a feed at the prime focus has no shape to change")
         sub, main = self.subreflector, self.reflector
+        for what, value in (("disc", self.blockage.diameter_mm), ("strut", self.blockage.strut_width_mm)):
+            if value is not None and value >= main.diameter_mm:
+                raise InputError(
+                    f"a blocked {what} of {value:g} mm leaves nothing of an aperture of {main.diameter_mm:g} mm; correct one of the two"
+                )
         if sub is not None and sub.kind == "cassegrain" and sub_vertex_z_mm(main, sub) <= 0:
             raise InputError(
                 f"the subreflector's vertex would lie at z = {sub_vertex_z_mm(main, sub):.4g} mm, behind the vertex of the dish; "
