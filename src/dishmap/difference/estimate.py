@@ -50,6 +50,9 @@ HOPELESS_NATS = 200.0
 NOTED_MISFIT, LEAST_FREEDOM, SETTLED_SCALE = 4.0, 12.0, 0.05
 # Sizes tried beside the learnt ones, as factors.
 SPREAD: tuple[dict[str, float], ...] = ({"normal_mm": 2.5}, {"rough_mm": 5.0}, {"rough_mm": 20.0}, {"normal_mm": 2.5, "rough_mm": 5.0})
+# How points are screened to follow: at first in any smooth way; then, when targets fit worse than claimed by this factor in variance, with
+# the least strain. The second estimate is taken when its targets fit better by that factor.
+SCREEN_WAY, STRICT_WAY, STRANGE_NOISE, BETTER_NOISE = "any", "least_strain", 2.0, 1.5
 # Slide beyond what a way says, as a mean strain: more than this is another way of moving.
 LARGEST_SLIDE = 5e-6
 # A surface that is rougher than this from target to target, or prints that stretch more on their own, are outliers in disguise.
@@ -100,8 +103,17 @@ def joint_estimate(
     priors: Priors,
     progress: Callable[[int, int], None] | None = None,
 ) -> JointEstimate:
-    """Weigh all ways in which the surface may have moved. camera_from_dish is that of the reference."""
-    return _Problem(changes, pattern, camera, camera_from_dish, priors).solve(progress or (lambda done, total: None))
+    """Weigh all ways in which the surface may have moved. camera_from_dish is that of the reference.
+
+    Outliers that pass the first screening bend every way until targets fit badly all over. When they do, the screening is made again by the
+    least strain alone, and that estimate is taken if its targets fit better.
+    """
+    tell = progress or (lambda done, total: None)
+    first = _Problem(changes, pattern, camera, camera_from_dish, priors).solve(tell)
+    if first.noise_factor < STRANGE_NOISE or priors.still or priors.slide not in (None, STRICT_WAY):
+        return first
+    second = _Problem(changes, pattern, camera, camera_from_dish, priors).solve(tell, STRICT_WAY)
+    return second if second.noise_factor < first.noise_factor / BETTER_NOISE and second.kept.mean() >= LEAST_KEPT else first
 
 
 class _Problem:
@@ -172,14 +184,16 @@ class _Problem:
             )
         return hub
 
-    def screen(self) -> None:
-        """Put aside targets that no surface could have carried along, before anything is learnt.
+    def screen(self, way: str) -> None:
+        """Put aside targets that no surface could have carried along in this way, before anything is learnt.
 
         An outlier drags its neighbours along at first, so the limit is lowered step by step from the worst misfit to the final one,
         and every target is judged anew at each (Blake and Zisserman 1987, graduated non-convexity).
         """
-        columns = self.columns("any", LENGTHS[0] * self.surfaces.fields.radius_mm)
-        wide = replace(SCREEN, expansion=self.expansion[1], focal=self.priors.focal_drift)
+        # a surface that is stiff in how it slides and in how it bends is no cover for outliers
+        slide, length = (SCREEN.slide_strain, LENGTHS[0]) if way == SCREEN_WAY else (LARGEST_SLIDE, LENGTHS[1])
+        columns = self.columns(way, length * self.surfaces.fields.radius_mm)
+        wide = replace(SCREEN, slide_strain=slide, expansion=self.expansion[1], focal=self.priors.focal_drift)
         found, limit, floor = posterior(self.evidence(columns), wide), np.inf, SCREEN_RATIO * USUAL_MISFIT
         for _ in range(SCREEN_ROUNDS):
             values = misfit(self.evidence(columns, found, everything=True), found)
@@ -222,9 +236,9 @@ class _Problem:
         found = learn_sizes(lambda at: self.evidence(columns, at), sizes, names, bounds, beat - HOPELESS_NATS)
         return Hypothesis(way, length, columns, found.posterior, found.log_weight, found.converged)
 
-    def solve(self, tell: Callable[[int, int], None]) -> JointEstimate:
+    def solve(self, tell: Callable[[int, int], None], screened_by: str = SCREEN_WAY) -> JointEstimate:
         """Fit all ways that are left open, first at the middle length, and weigh them."""
-        self.screen()
+        self.screen(screened_by)
         ways, lengths = self._ways(), self._lengths()
         middle = lengths[len(lengths) // 2]
         total = len(ways) + len(lengths)
