@@ -80,7 +80,7 @@ def peak(sources: Sources, wavelength_mm: float, start: tuple[float, float], pol
         w = np.sqrt(1 - u**2 - v**2)
         wave = moment * np.exp(1j * k * (u * x + v * y + w * z - sources.rays.path_mm))
         gradient, hessian = log_gain_slopes(wave, k, x - z * u / w, y - z * v / w)
-        step = _uphill(gradient, hessian)
+        step = uphill(gradient, hessian)
         u, v = u + step[0], v + step[1]
         if np.hypot(*step) < STILL or not u**2 + v**2 < 1:
             break
@@ -155,7 +155,7 @@ def _coarse_peak(sources: Sources, wavelength_mm: float, unit: float, polarizati
     return float(side[column]), float(side[row]), cross
 
 
-def _uphill(gradient: Array, hessian: Array) -> Array:
+def uphill(gradient: Array, hessian: Array) -> Array:
     """Newton's step towards a maximum, along the gradient's sense also where the function is not concave."""
     values, vectors = np.linalg.eigh(hessian)
     return np.asarray(vectors @ ((vectors.T @ gradient) / np.maximum(np.abs(values), 1e-300)))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from dishmap.errors import InputError
 from dishmap.rf.antenna import Antenna
-from dishmap.rf.beam import log_gain_slopes
+from dishmap.rf.beam import log_gain_slopes, uphill
 from dishmap.rf.climb import Aim, Place, aim_of, climb, convex, model
 from dishmap.rf.correct import CorrectionFound
 from dishmap.rf.deformation import Deformation
@@ -228,8 +228,7 @@ def _peak_dbi(traced: Traced, k: float, uv: Array, free: bool) -> float:
         r = direction_of(uv)
         wave = moment * np.exp(1j * k * (traced.point_mm @ r - traced.path_mm))
         gradient, hessian = log_gain_slopes(wave, k, x - z * r[0] / r[2], y - z * r[1] / r[2])
-        values, vectors = np.linalg.eigh(hessian)
-        uv = uv + vectors @ ((vectors.T @ gradient) / np.maximum(np.abs(values), 1e-300))
+        uv = uv + uphill(gradient, hessian)
     return gain_dbi(traced, moment, k, uv)
 
 

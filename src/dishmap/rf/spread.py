@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dishmap.rf.beam import CUTS_DEG, Beam, cut_angles_rad, cut_directions, cut_figures, log_gain_slopes
+from dishmap.rf.beam import CUTS_DEG, Beam, cut_angles_rad, cut_directions, cut_figures, log_gain_slopes, uphill
 from dishmap.rf.deformation import Deformation
 from dishmap.rf.feed import ludwig_axes, polarization_axes
 from dishmap.rf.gain import path_towards, ruze_loss_db
@@ -109,8 +109,7 @@ def _peak(wave: Complex, points: Array, k: float, beam: Beam) -> tuple[float, fl
         now = wave * np.exp(1j * k * (points @ (here - middle)))
         slopes = [points[:, i] - points[:, 2] * at / here[2] for i, at in enumerate((u, v))]
         gradient, hessian = log_gain_slopes(now, k, *slopes)
-        values, vectors = np.linalg.eigh(hessian)
-        step = vectors @ ((vectors.T @ gradient) / np.maximum(np.abs(values), 1e-300))
+        step = uphill(gradient, hessian)
         u, v = u + step[0], v + step[1]
         if np.hypot(*step) < 1e-9:
             break
