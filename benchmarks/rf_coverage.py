@@ -26,6 +26,7 @@ from difference_coverage import FAMILIES, POWERS, Bench, benches, measured, prin
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from dishmap.difference.changes import kabsch
 from dishmap.difference.difference_map import joint_difference
 from dishmap.difference.saved import saved_difference
 from dishmap.rf.antenna import Antenna, Feed, Reflector
@@ -60,14 +61,12 @@ def true_shape(at: Bench, state: State, later: Pose) -> Deformation:
         return at.pose.inverse().apply(later.apply(deform(state, surface, places, at.rim_mm)))
 
     points, surface = at.pattern.center_mm, at.pattern.surface
-    a, b = points.mean(axis=0), seen(points).mean(axis=0)
-    u, _, vt = np.linalg.svd((points - a).T @ (seen(points) - b))
-    turn = vt.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))]) @ u.T
+    back = kabsch(seen(points), points)
     k = np.arange(PLACES) + 0.5
     r, phi = 300.0 * np.sqrt(k / PLACES), np.pi * (1 + np.sqrt(5)) * k
     xy = np.column_stack([r * np.cos(phi), r * np.sin(phi)])
     nominal = np.column_stack([xy, (xy**2).sum(axis=1) / (4 * ANTENNA.reflector.focal_length_mm)])
-    value = (((seen(nominal) - b) @ turn + a - nominal) * surface.normal(xy)).sum(axis=1)
+    value = ((back.apply(seen(nominal)) - nominal) * surface.normal(xy)).sum(axis=1)
     terms = zernike_terms(TRUE_DEGREE)
     coefficients = np.linalg.lstsq(zernike_matrix(terms, *(xy / 300.0).T), value, rcond=None)[0]
     return Deformation(terms, coefficients, np.zeros(2), 300.0)

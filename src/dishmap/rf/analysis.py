@@ -18,7 +18,7 @@ from dishmap.rf.goals import Goal
 from dishmap.rf.margin import Margin, gain_margin
 from dishmap.rf.modes import Mode, modes_of
 from dishmap.rf.shape_field import ShapeField, deformation_of, draws, extrapolated, response_to_noise
-from dishmap.rf.sources import sampled, sources, wavelength_of
+from dishmap.rf.sources import illumination, sampled, sources, wavelength_of
 from dishmap.rf.spread import FLOOR_DB
 from dishmap.rf.state import Reading, State, antenna_state
 from dishmap.rf.target_beam import BeamShaped, target_beam
@@ -206,6 +206,6 @@ class _Run:
         currents = sources(self.antenna, self.shape, self.still, sampled(self.antenna, self.shape, wavelength))
         fit = best_fit(self.antenna, self.shape, currents, self.field.factor_mm)
         lit = slice(0, currents.nodes.lit)
-        weight = np.sqrt(np.maximum(currents.arriving[lit] * currents.nodes.weight_mm2[lit], 0.0))
+        weight = illumination(currents)
         outside = extrapolated(self.field, currents.nodes.xy_mm[lit])
         return fit, float(weight[outside].sum() / weight.sum())

@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from dishmap.errors import FitError
 from dishmap.rf.farfield import far_field, pattern_grid
 from dishmap.rf.feed import ludwig_axes, polarization_axes
-from dishmap.rf.pattern import decibels
+from dishmap.rf.pattern import decibels, direction_of
 from dishmap.rf.sources import Sources
 
 Array = NDArray[np.float64]
@@ -72,7 +72,7 @@ def peak(sources: Sources, wavelength_mm: float, start: tuple[float, float], pol
     """
     k = 2 * np.pi / wavelength_mm
     u, v = start
-    axes = ludwig_axes(np.array([[u, v, np.sqrt(1 - u**2 - v**2)]]))
+    axes = ludwig_axes(direction_of((u, v))[None])
     co_axis = polarization_axes(polarization, 1, *axes)[0][0]
     moment = sources.moment @ co_axis.conj()
     x, y, z = sources.point_mm.T
@@ -107,7 +107,7 @@ def cut_angles_rad(wavelength_mm: float, diameter_mm: float) -> Array:
 
 def cut_directions(u: float, v: float, phi_deg: float, angle_rad: Array) -> Array:
     """Direction cosines (A, 2) along the great circle through (u, v) that leaves it in the plane of azimuth phi."""
-    middle = np.array([u, v, np.sqrt(1 - u**2 - v**2)])
+    middle = direction_of((u, v))
     along = np.array([np.cos(np.radians(phi_deg)), np.sin(np.radians(phi_deg)), 0.0])
     along = along - (along @ middle) * middle
     along /= np.linalg.norm(along)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from dishmap.errors import FitError
 from dishmap.rf.antenna import Antenna
 from dishmap.rf.deformation import Deformation
-from dishmap.rf.sources import Sources, deformed_surface
+from dishmap.rf.sources import Sources, deformed_surface, illumination
 from dishmap.surface.paraboloid import Placement, distances
 from dishmap.surface.zernike import zernike_matrix
 
@@ -47,7 +47,7 @@ def best_fit(antenna: Antenna, deformation: Deformation, sources: Sources, facto
     lit = slice(0, sources.nodes.lit)
     points = deformed_surface(antenna, deformation, sources.nodes)[0][lit]
     area, normal = sources.nodes.weight_mm2[lit], sources.normal[lit]
-    weight = np.sqrt(np.maximum(sources.arriving[lit] * area, 0.0))
+    weight = illumination(sources)
     start = Placement(np.zeros(3), np.eye(3))
     parameters, residual, columns = _fitted(points, normal[:, 2], weight, start, antenna.reflector.focal_length_mm)
     # how the fit follows a displacement along the normal at each node

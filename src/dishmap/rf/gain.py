@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dishmap.rf.sources import Sources
+from dishmap.rf.pattern import direction_of
+from dishmap.rf.sources import Sources, illumination
 
 Array = NDArray[np.float64]
 
@@ -69,8 +70,7 @@ def budget(sources: Sources, wavelength_mm: float, diameter_mm: float, u: float,
 
 def path_towards(sources: Sources, u: float, v: float) -> Array:
     """Path (N,) from the feed over each source to a plane across the direction (u, v), less a constant."""
-    direction = np.array([u, v, np.sqrt(1 - u**2 - v**2)])
-    path = sources.rays.path_mm - sources.point_mm @ direction
+    path = sources.rays.path_mm - sources.point_mm @ direction_of((u, v))
     return np.asarray(path - path[0])
 
 
@@ -78,7 +78,7 @@ def path_error(sources: Sources, wavelength_mm: float, u: float, v: float) -> Pa
     """The half-path error at the beam's peak (u, v): what is left of the path there after its weighted mean."""
     lit = slice(0, sources.nodes.lit)
     area = sources.nodes.weight_mm2[lit]
-    weight = np.sqrt(np.maximum(sources.arriving[lit] * area, 0.0))
+    weight = illumination(sources)
     half = -0.5 * path_towards(sources, u, v)[lit]
     half = half - (weight @ half) / weight.sum()
     plain = float(np.sqrt((area @ (half - (area @ half) / area.sum()) ** 2) / area.sum()))

@@ -15,7 +15,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 
 from dishmap.rf.antenna import Actuators
-from dishmap.rf.correction import RIGID, Correction, correction_of, shape_terms
+from dishmap.rf.correction import RIGID, Correction, shape_terms
 from dishmap.surface.zernike import term_name, zernike_matrix
 
 Array = NDArray[np.float64]
@@ -102,11 +102,6 @@ def whole(limits: Limits, values: Array) -> Array:
     out = np.zeros(limits.size)
     out[limits.used] = values
     return out
-
-
-def correction_from(limits: Limits, values: Array) -> Correction:
-    """The correction with the values (P,) that move."""
-    return correction_of(whole(limits, values))
 
 
 def best_step(slope: Array, bend: Array, limits: Limits, values: Array, turned: Array, scale: Array, reach: float) -> Array:

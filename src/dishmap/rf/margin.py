@@ -23,8 +23,9 @@ from dishmap.rf.climb import Aim, Place, aim_of, climb, convex, model
 from dishmap.rf.correct import CorrectionFound
 from dishmap.rf.deformation import Deformation
 from dishmap.rf.limits import Limits, best_step, limits_of, whole, within
+from dishmap.rf.pattern import direction_of
 from dishmap.rf.sources import illuminated, sampled, wavelength_of
-from dishmap.rf.surrogate import DB, Traced, Tracer, co_moment, direction_of, fading, gain_dbi, linear_tracer, phase_slopes, tracer
+from dishmap.rf.surrogate import DB, Traced, Tracer, co_moment, fading, gain_dbi, linear_tracer, phase_slopes, tracer
 from dishmap.surface.zernike import zernike_matrix
 
 Array = NDArray[np.float64]

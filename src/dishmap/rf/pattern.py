@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -34,6 +34,12 @@ class PatternGrid:
     v: Array
     co: Complex
     cross: Complex
+
+
+def direction_of(uv: ArrayLike) -> Array:
+    """Unit vector (3,) of direction cosines (u, v)."""
+    u, v = np.asarray(uv, dtype=float)
+    return np.array([u, v, np.sqrt(1 - u**2 - v**2)])
 
 
 def decibels(power: Array) -> Array:

@@ -164,6 +164,12 @@ def sources_after(antenna: Antenna, dish: Illuminated, correction: Correction, n
     return Sources(dish.nodes, dish.normal, dish.point_mm, moment, rays, arriving)
 
 
+def illumination(sources: Sources) -> Array:
+    """Amplitude of the field times area (N,) at the lit nodes, those that cover the aperture as if nothing stood in it."""
+    lit = slice(0, sources.nodes.lit)
+    return np.asarray(np.sqrt(np.maximum(sources.arriving[lit] * sources.nodes.weight_mm2[lit], 0.0)))
+
+
 def deformed_surface(antenna: Antenna, deformation: Deformation, nodes: ApertureNodes) -> tuple[Array, Array, Array]:
     """Points (N, 3), area vectors (N, 3) and nominal unit normals (N, 3) at the nodes: x0 + d n0, and the product of its derivatives."""
     f = antenna.reflector.focal_length_mm

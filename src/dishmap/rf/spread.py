@@ -16,8 +16,8 @@ from dishmap.rf.beam import CUTS_DEG, Beam, cut_angles_rad, cut_directions, cut_
 from dishmap.rf.deformation import Deformation
 from dishmap.rf.feed import ludwig_axes, polarization_axes
 from dishmap.rf.gain import path_towards, ruze_loss_db
-from dishmap.rf.pattern import decibels
-from dishmap.rf.sources import Sources
+from dishmap.rf.pattern import decibels, direction_of
+from dishmap.rf.sources import Sources, illumination
 from dishmap.surface.zernike import zernike_matrix
 
 Array = NDArray[np.float64]
@@ -71,7 +71,7 @@ def spread(
 ) -> Spread:
     """Figures of surfaces with coefficients drawn_mm (K, T), near the deformation of which sources and beam were made."""
     k = 2 * np.pi / wavelength_mm
-    middle = _direction(beam.u, beam.v)
+    middle = direction_of((beam.u, beam.v))
     co_axis = polarization_axes(polarization, 1, *ludwig_axes(middle[None]))[0][0]
     wave = (sources.moment @ co_axis.conj()) * np.exp(1j * k * (sources.point_mm @ middle - sources.rays.path_mm))
     x, y = ((sources.nodes.xy_mm - deformation.center_mm) / deformation.radius_mm).T
@@ -96,16 +96,12 @@ def spread(
     return Spread(figures[:-1], np.array(floor))
 
 
-def _direction(u: float, v: float) -> Array:
-    return np.array([u, v, np.sqrt(1 - u**2 - v**2)])
-
-
 def _peak(wave: Complex, points: Array, k: float, beam: Beam) -> tuple[float, float, float]:
     """Direction and power of the peak of one drawn surface, from waves (N,) towards the mean surface's peak."""
-    middle = _direction(beam.u, beam.v)
+    middle = direction_of((beam.u, beam.v))
     u, v = beam.u, beam.v
     for _ in range(NEWTON_STEPS):
-        here = _direction(u, v)
+        here = direction_of((u, v))
         now = wave * np.exp(1j * k * (points @ (here - middle)))
         slopes = [points[:, i] - points[:, 2] * at / here[2] for i, at in enumerate((u, v))]
         gradient, hessian = log_gain_slopes(now, k, *slopes)
@@ -125,7 +121,7 @@ def _towards(waves: Complex, points: Array, k: float, middle: Array, uv: Array) 
 def _cut_figures(waves: Complex, points: Array, k: float, beam: Beam, wavelength_mm: float, diameter_mm: float) -> Array:
     """Widths in degrees and sidelobes in dB (K, 4) in the principal cuts through the mean surface's peak."""
     angles = cut_angles_rad(wavelength_mm, diameter_mm)
-    middle = _direction(beam.u, beam.v)
+    middle = direction_of((beam.u, beam.v))
     widths, lobes = [], []
     for phi in CUTS_DEG:
         power = decibels(np.abs(_towards(waves, points, k, middle, cut_directions(beam.u, beam.v, phi, angles))) ** 2)
@@ -138,8 +134,8 @@ def _cut_figures(waves: Complex, points: Array, k: float, beam: Beam, wavelength
 def _weighted_rms(sources: Sources, beam: Beam, change: Array, peaks: Array) -> Array:
     """Illumination-weighted rms half-path error (K,), each at its own peak (K, 3), for changes of the path (N, K)."""
     lit = slice(0, sources.nodes.lit)
-    weight = np.sqrt(np.maximum(sources.arriving[lit] * sources.nodes.weight_mm2[lit], 0.0))
-    turned = np.stack([_direction(u, v) for u, v in peaks[:, :2]], axis=1) - _direction(beam.u, beam.v)[:, None]
+    weight = illumination(sources)
+    turned = np.stack([direction_of((u, v)) for u, v in peaks[:, :2]], axis=1) - direction_of((beam.u, beam.v))[:, None]
     path = path_towards(sources, beam.u, beam.v)[lit, None] + change[lit] - sources.point_mm[lit] @ turned
     half = path / 2 - weight @ path / 2 / weight.sum()
     return np.asarray(np.sqrt(weight @ half**2 / weight.sum()))

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from dishmap.errors import InputError
 from dishmap.rf.climb import Aim, climb
 from dishmap.rf.limits import Limits, best_step, whole
-from dishmap.rf.surrogate import Traced, Tracer, direction_of, phase_slopes
+from dishmap.rf.pattern import direction_of
+from dishmap.rf.surrogate import Traced, Tracer, phase_slopes
 
 Array = NDArray[np.float64]
 

@@ -23,6 +23,7 @@ from dishmap.errors import InputError
 from dishmap.rf.antenna import Antenna
 from dishmap.rf.correction import correction_of
 from dishmap.rf.feed import ludwig_axes, polarization_axes
+from dishmap.rf.pattern import direction_of
 from dishmap.rf.sources import Illuminated, sources_after
 
 Array = NDArray[np.float64]
@@ -114,11 +115,6 @@ def co_moment(traced: Traced, uv: Array) -> Complex:
     direction = direction_of(uv)[None, :]
     co, _ = polarization_axes(traced.polarization, 1, *ludwig_axes(direction))
     return np.asarray(traced.moment @ co[0].conj())
-
-
-def direction_of(uv: Array) -> Array:
-    """Unit vector (3,) of direction cosines (2,)."""
-    return np.array([uv[0], uv[1], np.sqrt(1 - uv[0] ** 2 - uv[1] ** 2)])
 
 
 def gain_dbi(traced: Traced, moment: Complex, wavenumber: float, uv: Array) -> float:
