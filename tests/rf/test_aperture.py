@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -71,13 +71,16 @@ def lens(a: float, b: float, apart: float) -> float:
         return 0.0
     if apart <= abs(a - b):
         return float(np.pi * min(a, b) ** 2)
-    one = a**2 * np.arccos((apart**2 + a**2 - b**2) / (2 * apart * a))
-    two = b**2 * np.arccos((apart**2 + b**2 - a**2) / (2 * apart * b))
-    kite = 0.5 * np.sqrt((-apart + a + b) * (apart + a - b) * (apart - a + b) * (apart + a + b))
+    # circles that touch are off by rounding
+    one = a**2 * np.arccos(np.clip((apart**2 + a**2 - b**2) / (2 * apart * a), -1, 1))
+    two = b**2 * np.arccos(np.clip((apart**2 + b**2 - a**2) / (2 * apart * b), -1, 1))
+    kite = 0.5 * np.sqrt(max((-apart + a + b) * (apart + a - b) * (apart - a + b) * (apart + a + b), 0.0))
     return float(one + two - kite)
 
 
 @given(st.floats(0, 900), st.floats(20, 500), st.floats(-300, 300))
+@example(446.0, 337.0, 0.0)
+@example(1.75, 20.0, -299.0)
 def test_a_shadow_that_the_rim_cuts_is_a_lens(offset: float, shadow: float, at: float) -> None:
     nodes = aperture_nodes(antenna(offset_mm=offset), 20, 200, shadow, at)
     shaded = -nodes.weight_mm2[nodes.lit :].sum()
